@@ -1,0 +1,117 @@
+"""Files that are whole or absent: every write goes to a neighbour first and is renamed into place."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from .errors import InputError
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary neighbour of `path` (same suffix) that replaces it if the block succeeds.
+
+    Raises InputError naming the folder when it cannot be written or the disk is full.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or choose a folder you may write to."
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path, value) -> None:
+    write_bytes(path, (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode("utf-8"))
+
+
+def read_json(path: Path, what: str):
+    """Parsed JSON of `path`; `what` names the content in the error message. Raises InputError."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: {what} not found; check the path.")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: {what} cannot be read as JSON ({error}); make the file again.") from error
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write uint8 (H, W) or RGB (H, W, 3), or uint16 (H, W), as PNG."""
+    import cv2
+
+    ok, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not ok:
+        raise ValueError(f"{path}: image of shape {image.shape} {image.dtype} cannot be encoded")
+    write_bytes(path, data.tobytes())
+
+
+def read_image_rgb(path: Path) -> np.ndarray:
+    """Image file (PNG, JPEG, TIFF, 8 or 16 bit, grey or colour) as uint8 RGB (H, W, 3). Raises InputError."""
+    import cv2
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: image not found; check the path.")
+    # Through bytes: cv2.imread fails on non-ASCII paths on Windows.
+    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR) if path.stat().st_size else None
+    if image is None:
+        raise InputError(f"{path}: not an image that can be read (or damaged); give a PNG, JPEG or TIFF file.")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def read_label_map(path: Path) -> np.ndarray:
+    """Single-channel label PNG as uint8 (H, W). Raises InputError."""
+    import cv2
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: label map not found; check the path.")
+    labels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
+    if labels is None:
+        raise InputError(f"{path}: label map cannot be read (or damaged); save it as an 8-bit grey PNG.")
+    if labels.ndim == 3:
+        if np.ptp(labels[..., :3].astype(int), axis=2).any():
+            raise InputError(f"{path}: label map is a colour image; save it as an 8-bit grey PNG with values 0, 1, 2.")
+        labels = labels[..., 0]
+    return labels.astype(np.uint8)
+
+
+def sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as stream:
+        for block in iter(lambda: stream.read(1 << 20), b""):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def require_space(folder: Path, needed_mb: float) -> None:
+    """Raise InputError when the disk of `folder` (or its nearest existing parent) has less than `needed_mb` free."""
+    folder = Path(folder).absolute()
+    while not folder.exists():
+        folder = folder.parent
+    free_mb = shutil.disk_usage(folder).free / 2**20
+    if free_mb < needed_mb:
+        raise InputError(
+            f"{folder}: {free_mb:.0f} MB free, about {needed_mb:.0f} MB needed; free some space or choose another disk."
+        )
