@@ -1,0 +1,247 @@
+"""A case: one patient's meshes and camera, and all that is made from them, in one folder of open formats."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import shutil
+from functools import cached_property
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from .. import files
+from ..errors import InputError, Problems
+from ..geometry.camera import Camera, read_camera, write_camera
+from .meshes import Mesh, declared_space, read_mesh, write_vtp
+
+FORMAT = "ExpectedAppearances case"
+FORMAT_VERSION = 1
+MANIFEST_NAME = "case.json"
+SPACES = ("LPS", "RAS")
+LARGEST_GAP_MM = 10.0  # between the boxes around vessels and cortex
+FARTHEST_VIEW_MM = 3000.0  # from which the whole vessels should fill the view; microscopes work at 200-600 mm
+NEEDED_MB = 20.0
+
+
+class Case:
+    """An existing case folder. Meshes are read on first use; `manifest` is case.json."""
+
+    def __init__(self, folder: Path, manifest: dict, camera: Camera):
+        self.folder = Path(folder)
+        self.manifest = manifest
+        self.camera = camera
+
+    @property
+    def space(self) -> str:
+        """'LPS' or 'RAS': the axes of the world, which is the mesh files' coordinates."""
+        return self.manifest["space"]
+
+    @cached_property
+    def vessels(self) -> Mesh:
+        return read_mesh(self.folder / self.manifest["inputs"]["vessels"]["file"], "vessel mesh")
+
+    @cached_property
+    def cortex(self) -> Mesh | None:
+        entry = self.manifest["inputs"].get("cortex")
+        return read_mesh(self.folder / entry["file"], "cortex mesh") if entry else None
+
+    @property
+    def poses_path(self) -> Path:
+        return self.folder / "poses" / "poses.json"
+
+    @property
+    def masks_folder(self) -> Path:
+        return self.folder / "masks"
+
+    @property
+    def appearances_folder(self) -> Path:
+        return self.folder / "appearances"
+
+    @property
+    def model_folder(self) -> Path:
+        return self.folder / "model"
+
+    @property
+    def logs_folder(self) -> Path:
+        return self.folder / "logs"
+
+    @staticmethod
+    def create(
+        folder: Path, vessels_path: Path, cortex_path: Path | None, camera_path: Path | Camera, space: str = "LPS"
+    ) -> Case:
+        """Make a case folder from a vessel mesh, a cortex mesh (or None) and a camera file (or a Camera).
+
+        Everything is checked first; raises InputError with all problems. The folder appears whole or not at all.
+        """
+        folder = Path(folder).absolute()
+        problems = Problems()
+        _check_new_folder(folder, problems)
+        if space not in SPACES:
+            problems.add(f"space: '{space}' is not known; give LPS (most files, and 3D Slicer's) or RAS.")
+        camera = vessels = cortex = None
+        with problems.collect():
+            vessels = read_mesh(vessels_path, "vessel mesh")
+        with problems.collect():
+            cortex = read_mesh(cortex_path, "cortex mesh") if cortex_path else None
+        with problems.collect():
+            camera = camera_path if isinstance(camera_path, Camera) else read_camera(camera_path)
+        sources = {"vessels": vessels_path, "cortex": cortex_path if cortex else None}
+        for source in filter(None, sources.values()):
+            declared = declared_space(source)
+            if declared and declared != space:
+                problems.add(f"{source}: says that its space is {declared}, not {space}; give --space {declared}.")
+        if vessels and camera:
+            _check_view(vessels, camera, vessels_path, problems)
+        if vessels and cortex:
+            _check_distance(vessels, cortex, vessels_path, cortex_path, problems)
+        problems.raise_if_any()
+
+        part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+        try:
+            part.mkdir(parents=True)
+            inputs = {}
+            for name, mesh in (("vessels", vessels), ("cortex", cortex)):
+                if mesh:
+                    write_vtp(part / f"{name}.vtp", mesh)
+                    inputs[name] = _input_entry(part / f"{name}.vtp", sources[name])
+            write_camera(part / "camera.json", camera)
+            inputs["camera"] = _input_entry(
+                part / "camera.json", None if isinstance(camera_path, Camera) else camera_path
+            )
+            manifest = {
+                "format": FORMAT,
+                "format_version": FORMAT_VERSION,
+                "created": _now(),
+                "versions": _versions(),
+                "space": space,
+                "inputs": inputs,
+                "stages": {},
+            }
+            files.write_json(part / MANIFEST_NAME, manifest)
+            if folder.exists():
+                folder.rmdir()  # empty, as checked; os.replace onto a folder fails on Windows
+            os.replace(part, folder)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: cannot be written ({error.strerror or error}); "
+                "free some space or choose a folder you may write to."
+            ) from error
+        except InputError as error:
+            raise InputError(problem.replace(str(part), str(folder)) for problem in error.problems) from error
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        return Case(folder, manifest, camera)
+
+    @staticmethod
+    def open(folder: Path) -> Case:
+        """Open a case folder and check its inputs against the manifest. Raises InputError with all problems."""
+        folder = Path(folder).absolute()
+        path = folder / MANIFEST_NAME
+        if not path.is_file():
+            raise InputError(f"{folder}: not a case folder (no {MANIFEST_NAME} in it); make one with `new`.")
+        manifest = _read_manifest(path)
+        problems = Problems()
+        for name, entry in manifest["inputs"].items():
+            if not (folder / entry["file"]).is_file():
+                problems.add(f"{folder / entry['file']}: {name} of the case is missing; restore it or make a new case.")
+            elif files.sha256(folder / entry["file"]) != entry["sha256"]:
+                problems.add(
+                    f"{folder / entry['file']}: {name} is not the file the case was made with (SHA-256 differs); "
+                    "restore it, or make a new case, since all stages rest on it."
+                )
+        problems.raise_if_any()
+        return Case(folder, manifest, read_camera(folder / manifest["inputs"]["camera"]["file"]))
+
+    def record(self, stage: str, **values) -> None:
+        """Merge `values` into manifest["stages"][stage] (with versions and time) and write case.json."""
+        path = self.folder / MANIFEST_NAME
+        self.manifest = _read_manifest(path)  # another process may have recorded a stage meanwhile
+        entry = self.manifest["stages"].setdefault(stage, {})
+        entry.update({"updated": _now(), "versions": _versions()} | values)
+        files.write_json(path, self.manifest)
+
+
+def _check_new_folder(folder: Path, problems: Problems) -> None:
+    if folder.is_file():
+        problems.add(f"{folder}: is a file; give the name of a new folder.")
+        return
+    if folder.is_dir() and any(folder.iterdir()):
+        problems.add(f"{folder}: exists and is not empty; give a new folder, or remove this one first.")
+    parent = folder.parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        problems.add(f"{parent}: no folder can be made here; choose a folder you may write to.")
+        return
+    with problems.collect():
+        files.require_space(folder, NEEDED_MB)
+
+
+def _check_view(vessels: Mesh, camera: Camera, vessels_path: Path, problems: Problems) -> None:
+    # field_of_view_mm is linear in depth: the depth at which the view is as wide as the vessels.
+    filled_at_mm = 2 * vessels.radius_mm / camera.field_of_view_mm(1.0)
+    if filled_at_mm > FARTHEST_VIEW_MM:
+        problems.add(
+            f"{vessels_path}: the vessels ({2 * vessels.radius_mm:.0f} mm across) could never be in view: the camera "
+            f"sees {camera.field_of_view_mm(300.0):.1f} mm at 300 mm; cut the mesh to the craniotomy, or check the camera."
+        )
+
+
+def _check_distance(vessels: Mesh, cortex: Mesh, vessels_path: Path, cortex_path: Path, problems: Problems) -> None:
+    if _gap_mm(vessels.vertices_mm, cortex.vertices_mm) <= LARGEST_GAP_MM:
+        return
+    gap_mm = _gap_mm(vessels.vertices_mm, cortex.vertices_mm)
+    flipped_gap_mm = _gap_mm(vessels.vertices_mm, cortex.vertices_mm * (-1.0, -1.0, 1.0))
+    cause = (
+        "one looks like LPS and the other like RAS, save both in the same space"
+        if flipped_gap_mm <= LARGEST_GAP_MM
+        else "give meshes of the same patient in the same space"
+    )
+    problems.add(f"{cortex_path}: the cortex lies {gap_mm:.0f} mm from the vessels ({vessels_path}); {cause}.")
+
+
+def _gap_mm(first_mm: np.ndarray, second_mm: np.ndarray) -> float:
+    """Distance between the axis-aligned boxes around two sets of points."""
+    apart = np.maximum(first_mm.min(0) - second_mm.max(0), second_mm.min(0) - first_mm.max(0))
+    return float(np.linalg.norm(np.maximum(apart, 0.0)))
+
+
+def _input_entry(path: Path, source: Path | None) -> dict:
+    entry = {"file": path.name, "source": Path(source).absolute().as_posix() if source else None}
+    return entry | {"sha256": files.sha256(path)}
+
+
+def _read_manifest(path: Path) -> dict:
+    manifest = files.read_json(path, "case manifest")
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise InputError(f"{path}: not the manifest of a case; make a case with `new`.")
+    version = manifest.get("format_version")
+    if not isinstance(version, int) or version > FORMAT_VERSION:
+        raise InputError(
+            f"{path}: case of format version {version}, newer than {FORMAT_VERSION}, the newest known here; "
+            "update ExpectedAppearances, or make the case again."
+        )
+    inputs = manifest.get("inputs")
+    whole = isinstance(inputs, dict) and {"vessels", "camera"} <= inputs.keys() and manifest.get("space") in SPACES
+    whole = whole and all(isinstance(e, dict) and {"file", "sha256"} <= e.keys() for e in inputs.values())
+    if not whole or not isinstance(manifest.get("stages"), dict):
+        raise InputError(f"{path}: case manifest lacks its space, inputs or stages; restore it or make a new case.")
+    return manifest
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+
+
+def _versions() -> dict:
+    """Versions of what a case's content depends on, where installed."""
+    versions = {"python": platform.python_version()}
+    for package in ("expected-appearances", "numpy", "vtk", "torch", "onnxruntime", "opencv-python-headless"):
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions

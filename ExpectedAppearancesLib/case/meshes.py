@@ -1,0 +1,172 @@
+"""Triangle meshes in mm: read from the formats that segmentation tools write, checked, written as VTP."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .. import files
+from ..errors import InputError
+
+SMALLEST_EXTENT_MM = 1.0
+LARGEST_EXTENT_MM = 2000.0
+FORMATS = (".vtp", ".vtk", ".stl", ".ply", ".obj")
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """vertices_mm (N, 3) float64 in the file's own space; triangles (F, 3) int64, indices of vertices."""
+
+    vertices_mm: np.ndarray
+    triangles: np.ndarray
+
+    @property
+    def centroid_mm(self) -> np.ndarray:
+        """Mean of the vertices, (3,)."""
+        return self.vertices_mm.mean(axis=0)
+
+    @property
+    def radius_mm(self) -> float:
+        """Largest distance of a vertex from the centroid."""
+        return float(np.linalg.norm(self.vertices_mm - self.centroid_mm, axis=1).max())
+
+    def vertex_normals(self) -> np.ndarray:
+        """Area-weighted unit normals, (N, 3); 0 for a vertex of no triangle."""
+        a, b, c = (self.vertices_mm[self.triangles[:, i]] for i in range(3))
+        face_normals = np.cross(b - a, c - a)  # length = 2 x area: the weight
+        corners = self.triangles.ravel()
+        repeated = np.repeat(face_normals, 3, axis=0)
+        count = len(self.vertices_mm)
+        normals = np.stack([np.bincount(corners, repeated[:, axis], count) for axis in range(3)], axis=1)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+
+    def to_polydata(self):
+        """vtkPolyData of its own memory, with point normals."""
+        from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+        from vtkmodules.vtkCommonCore import vtkPoints
+        from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+        points = vtkPoints()
+        points.SetData(numpy_to_vtk(np.ascontiguousarray(self.vertices_mm, np.float64), deep=True))
+        offsets = np.arange(0, 3 * len(self.triangles) + 1, 3, dtype=np.int64)
+        cells = vtkCellArray()
+        cells.SetData(
+            numpy_to_vtkIdTypeArray(offsets, deep=True),
+            numpy_to_vtkIdTypeArray(np.ascontiguousarray(self.triangles.ravel(), np.int64), deep=True),
+        )
+        normals = numpy_to_vtk(self.vertex_normals().astype(np.float32), deep=True)
+        normals.SetName("Normals")
+        polydata = vtkPolyData()
+        polydata.SetPoints(points)
+        polydata.SetPolys(cells)
+        polydata.GetPointData().SetNormals(normals)
+        return polydata
+
+    @classmethod
+    def from_polydata(cls, polydata) -> Mesh:
+        """Triangles of a vtkPolyData; polygons and strips are split, lines and degenerate triangles dropped.
+
+        Raises InputError when cells refer to points that do not exist.
+        """
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+        from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+
+        if not polydata.GetNumberOfPoints():
+            return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+        for cells in (polydata.GetPolys(), polydata.GetStrips(), polydata.GetLines(), polydata.GetVerts()):
+            corners = vtk_to_numpy(cells.GetConnectivityArray())
+            if corners.size and not 0 <= corners.min() <= corners.max() < polydata.GetNumberOfPoints():
+                raise InputError("mesh: a cell refers to a point that does not exist; save the mesh again.")
+        splitter = vtkTriangleFilter()
+        splitter.PassVertsOff()
+        splitter.PassLinesOff()
+        splitter.SetInputData(polydata)
+        splitter.Update()
+        vertices_mm = vtk_to_numpy(splitter.GetOutput().GetPoints().GetData()).astype(np.float64)
+        triangles = vtk_to_numpy(splitter.GetOutput().GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+        a, b, c = triangles.T
+        return cls(vertices_mm, triangles[(a != b) & (b != c) & (c != a)])
+
+
+def read_mesh(path: Path, what: str) -> Mesh:
+    """Mesh of a .vtp, .vtk, .stl, .ply or .obj file; `what` ("vessel mesh") names it in messages. Raises InputError."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: {what} not found; check the path.")
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: {what} has an unknown format; save it as one of {', '.join(FORMATS)}.")
+    try:
+        mesh = Mesh.from_polydata(_read_polydata(path))
+    except InputError as error:
+        raise InputError(
+            f"{path}: {what} cannot be read, or is cut short ({error}); export it again as {path.suffix}."
+        ) from error
+    if not len(mesh.triangles):
+        raise InputError(f"{path}: {what} has no triangles; export the surface model, not points or centrelines.")
+    if not np.isfinite(mesh.vertices_mm).all():
+        raise InputError(f"{path}: {what} has coordinates that are not numbers (NaN or infinite); export it again.")
+    extent_mm = float(np.ptp(mesh.vertices_mm, axis=0).max())
+    if extent_mm < SMALLEST_EXTENT_MM:
+        raise InputError(
+            f"{path}: {what} is only {extent_mm:.3g} mm wide, it looks like metres; scale it by 1000 to millimetres."
+        )
+    if extent_mm > LARGEST_EXTENT_MM:
+        raise InputError(
+            f"{path}: {what} is {extent_mm:.0f} mm wide, more than {LARGEST_EXTENT_MM:.0f} mm; "
+            "it looks like micrometres or holds stray points. Scale it to millimetres, or remove them."
+        )
+    return mesh
+
+
+def write_vtp(path: Path, mesh: Mesh) -> None:
+    """Write `mesh` with point normals as VTK XML, whole or not at all. Raises InputError when it cannot."""
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(mesh.to_polydata())
+    # To memory: VTK reports a full disk only on the terminal. Base64 keeps the text ASCII.
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    files.write_bytes(Path(path), writer.GetOutputString().encode("ascii"))
+
+
+def declared_space(path: Path) -> str | None:
+    """'LPS' or 'RAS' where the file says so in its header, as those that 3D Slicer writes do; else None."""
+    try:
+        with open(path, "rb") as stream:
+            found = re.search(rb"SPACE=(LPS|RAS)", stream.read(2048))
+    except OSError:
+        return None
+    return found.group(1).decode() if found else None
+
+
+def _read_polydata(path: Path):
+    from vtkmodules.vtkIOGeometry import vtkOBJReader, vtkSTLReader
+    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+    from vtkmodules.vtkIOPLY import vtkPLYReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    suffix = path.suffix.lower()
+    readers = (vtkXMLPolyDataReader, vtkPolyDataReader, vtkSTLReader, vtkPLYReader, vtkOBJReader)
+    reader = dict(zip(FORMATS, readers))[suffix]()
+    messages: list[str] = []
+
+    def keep(_caller, _event, text):
+        messages.append(" ".join(text.split("):")[-1].split()))
+
+    keep.CallDataType = "string0"
+    # Observed so that messages reach the user through InputError, not the terminal.
+    for observed in (reader, reader.GetXMLParser()) if hasattr(reader, "GetXMLParser") else (reader,):
+        if observed is not None:
+            observed.AddObserver("ErrorEvent", keep)
+            observed.AddObserver("WarningEvent", keep)
+    reader.SetFileName(str(path))
+    reader.Update()
+    if messages:
+        raise InputError(messages[0].rstrip("."))
+    return reader.GetOutput()
