@@ -1,0 +1,74 @@
+"""Elastic deformation that imitates brain shift in the image and keeps the pose label true (paper, section 2.2).
+
+A deformation with an affine part moves, turns or scales the whole view: the label would be wrong by millimetres.
+So the affine part is removed exactly: what is left bends the image without moving it as a whole.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import cv2
+import numpy as np
+
+
+def displacement_field(
+    shape_hw: tuple[int, int], amplitude_px: float, smoothness_px: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Smooth random displacement (H, W, 2), float32, px: x then y, without any affine part.
+
+    amplitude_px: length of the longest displacement. smoothness_px: distance over which displacements differ; the
+    field does not fold while amplitude_px stays below about a quarter of it. The least-squares best-fit affine of the
+    field over the pixel grid is zero (to float32). Raises ValueError for sizes below 4 px or values out of range.
+    """
+    height, width = shape_hw
+    if min(height, width) < 4 or amplitude_px < 0 or smoothness_px < 1:
+        raise ValueError(f"shape {shape_hw}, amplitude {amplitude_px} px, smoothness {smoothness_px} px: out of range")
+    if amplitude_px == 0:
+        return np.zeros((height, width, 2), np.float32)
+    # With fewer than three nodes across, little but an affine field could come out.
+    spacing_px = min(float(smoothness_px), min(height, width) / 3)
+    rows, columns = (math.ceil(size / spacing_px) + 2 for size in (height, width))
+    nodes = rng.standard_normal((rows, columns, 2), np.float32)
+    size = (round(columns * spacing_px), round(rows * spacing_px))
+    field = cv2.resize(nodes, size, interpolation=cv2.INTER_CUBIC)
+    # A random offset, so that the nodes have no preferred place in the image.
+    top, left = rng.integers(0, size[1] - height + 1), rng.integers(0, size[0] - width + 1)
+    field = without_affine_part(field[top : top + height, left : left + width])
+    longest = float(cv2.magnitude(field[..., 0].copy(), field[..., 1].copy()).max())
+    return (field * (amplitude_px / longest)).astype(np.float32)
+
+
+def without_affine_part(field_px: np.ndarray) -> np.ndarray:
+    """The field (H, W, 2) less its least-squares best-fit affine over the pixel grid, as float64."""
+    height, width = field_px.shape[:2]
+    basis, flat = _affine_basis(height, width), field_px.reshape(height * width, 2).astype(np.float64)
+    return (flat - basis.T @ (basis @ flat)).reshape(height, width, 2)
+
+
+@functools.lru_cache(maxsize=8)
+def _affine_basis(height: int, width: int) -> np.ndarray:
+    """Orthonormal basis (3, H*W) of {1, x, y}: on a full pixel grid the centred x and y are orthogonal."""
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    basis = np.stack([np.ones(height * width), (x - x.mean()).ravel(), (y - y.mean()).ravel()])
+    return basis / np.linalg.norm(basis, axis=1, keepdims=True)
+
+
+def warp(image: np.ndarray, field_px: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Image (H, W[, C]) whose pixel (x, y) shows what `image` has at (x, y) + field; reflected at the border.
+
+    Use cv2.INTER_NEAREST for label maps, so that no labels are mixed.
+    """
+    height, width = image.shape[:2]
+    if field_px.shape != (height, width, 2):
+        raise ValueError(f"field {field_px.shape} does not fit image {image.shape}")
+    x, y = _grid(height, width)
+    source_x, source_y = x + field_px[..., 0], y + field_px[..., 1]
+    return cv2.remap(image, source_x, source_y, interpolation, borderMode=cv2.BORDER_REFLECT_101)
+
+
+@functools.lru_cache(maxsize=8)
+def _grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    return x, y
