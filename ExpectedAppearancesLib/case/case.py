@@ -186,7 +186,8 @@ def _check_view(vessels: Mesh, camera: Camera, vessels_path: Path, problems: Pro
     if filled_at_mm > FARTHEST_VIEW_MM:
         problems.add(
             f"{vessels_path}: the vessels ({2 * vessels.radius_mm:.0f} mm across) could never be in view: the camera "
-            f"sees {camera.field_of_view_mm(300.0):.1f} mm at 300 mm; cut the mesh to the craniotomy, or check the camera."
+            f"sees {camera.field_of_view_mm(300.0):.1f} mm at 300 mm; "
+            "cut the mesh to the craniotomy, or check the camera."
         )
 
 

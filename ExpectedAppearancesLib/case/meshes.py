@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from ..errors import InputError
 
 SMALLEST_EXTENT_MM = 1.0
 LARGEST_EXTENT_MM = 2000.0
+PLY_TYPES = dict(char="b", uchar="B", short="h", ushort="H", int="i", uint="I", float="f", double="d")
+PLY_TYPES |= dict(int8="b", uint8="B", int16="h", uint16="H", int32="i", uint32="I", float32="f", float64="d")
 FORMATS = (".vtp", ".vtk", ".stl", ".ply", ".obj")
 
 
@@ -80,7 +83,7 @@ class Mesh:
         for cells in (polydata.GetPolys(), polydata.GetStrips(), polydata.GetLines(), polydata.GetVerts()):
             corners = vtk_to_numpy(cells.GetConnectivityArray())
             if corners.size and not 0 <= corners.min() <= corners.max() < polydata.GetNumberOfPoints():
-                raise InputError("mesh: a cell refers to a point that does not exist; save the mesh again.")
+                raise InputError("a cell refers to a point that does not exist")
         splitter = vtkTriangleFilter()
         splitter.PassVertsOff()
         splitter.PassLinesOff()
@@ -146,27 +149,74 @@ def declared_space(path: Path) -> str | None:
 
 
 def _read_polydata(path: Path):
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
     from vtkmodules.vtkIOGeometry import vtkOBJReader, vtkSTLReader
     from vtkmodules.vtkIOLegacy import vtkPolyDataReader
     from vtkmodules.vtkIOPLY import vtkPLYReader
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     suffix = path.suffix.lower()
+    if suffix == ".ply":
+        _check_ply_is_whole(path)
     readers = (vtkXMLPolyDataReader, vtkPolyDataReader, vtkSTLReader, vtkPLYReader, vtkOBJReader)
     reader = dict(zip(FORMATS, readers))[suffix]()
-    messages: list[str] = []
-
-    def keep(_caller, _event, text):
-        messages.append(" ".join(text.split("):")[-1].split()))
-
-    keep.CallDataType = "string0"
-    # Observed so that messages reach the user through InputError, not the terminal.
-    for observed in (reader, reader.GetXMLParser()) if hasattr(reader, "GetXMLParser") else (reader,):
-        if observed is not None:
-            observed.AddObserver("ErrorEvent", keep)
-            observed.AddObserver("WarningEvent", keep)
     reader.SetFileName(str(path))
-    reader.Update()
-    if messages:
-        raise InputError(messages[0].rstrip("."))
+    # VTK reports trouble only as text in its output window, and then returns what it has got.
+    usual_window, window = vtkOutputWindow.GetInstance(), vtkStringOutputWindow()
+    usual_verbosity = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkOutputWindow.SetInstance(window)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    try:
+        reader.Update()
+    finally:
+        vtkLogger.SetStderrVerbosity(usual_verbosity)
+        vtkOutputWindow.SetInstance(usual_window)
+    messages = re.findall(
+        r"^(?:ERROR|Warning|Generic Warning): In .*\n(?:vtk\w+ \(0x\w+\): )?(.+)", window.GetOutput(), re.MULTILINE
+    )
+    trouble = [m for m in messages if re.search("error|cannot|could not|premature|mismatch", m, re.IGNORECASE)]
+    if trouble or "ERROR:" in window.GetOutput():
+        raise InputError((trouble or messages or ["VTK reports an error"])[0].strip(" ."))
     return reader.GetOutput()
+
+
+def _check_ply_is_whole(path: Path) -> None:
+    """Raise InputError when a PLY file ends early: vtkPLYReader then crashes, or returns a part without a word."""
+    data = path.read_bytes()
+    header, mark, body = data.partition(b"end_header")
+    body = body.split(b"\n", 1)[1] if b"\n" in body else b""
+    if not header.startswith(b"ply") or not mark:
+        raise InputError("no complete PLY header")
+    layout, elements = "", []
+    try:
+        for words in (line.split() for line in header.decode("ascii", "replace").splitlines()):
+            if words[:1] == ["format"]:
+                layout = words[1]
+            elif words[:1] == ["element"]:
+                elements.append((int(words[2]), []))
+            elif words[:1] == ["property"]:
+                types = words[2:4] if words[1] == "list" else words[1:2]
+                elements[-1][1].append([PLY_TYPES[name] for name in types])
+    except (IndexError, ValueError, KeyError) as error:
+        raise InputError(f"PLY header is damaged ({error})") from error
+    if layout == "ascii":
+        whole = len([line for line in body.splitlines() if line.strip()]) >= sum(count for count, _ in elements)
+    else:
+        whole = _binary_ply_is_whole(body, elements, "<" if layout == "binary_little_endian" else ">")
+    if not whole:
+        raise InputError("the file ends early")
+
+
+def _binary_ply_is_whole(body: bytes, elements: list, byte_order: str) -> bool:
+    position = 0
+    for count, properties in elements:
+        if all(len(types) == 1 for types in properties):
+            position += count * sum(struct.calcsize(types[0]) for types in properties)
+            continue
+        for _ in range(count):
+            for first, *item in properties:
+                if position + struct.calcsize(first) > len(body):
+                    return False
+                length = struct.unpack_from(byte_order + first, body, position)[0] if item else 0
+                position += struct.calcsize(first) + (int(length) * struct.calcsize(item[0]) if item else 0)
+    return position <= len(body)
