@@ -19,20 +19,19 @@ Report the versions of Python and of the packages, the devices with their memory
 whether VTK can render with no display, and which network weights are found. Send the output with a support request.
 Exit code 0 when everything needed is there, 1 otherwise."""
 
-# Distribution names; where several provide the same module, any one will do. True: every command needs it.
+# Distribution names (any one will do) and what cannot work without; "" where nothing stops.
 PACKAGES = (
-    (("numpy",), True),
-    (("vtk", "slicer-core"), True),
-    (("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"), True),
-    (("scipy",), True),
-    (("scikit-image",), False),
-    (("onnxruntime", "onnxruntime-gpu"), True),
-    (("torch",), False),
-    (("onnx",), False),
-    (("safetensors",), False),
-    (("matplotlib",), False),
-    (("jinja2",), False),
-    (("slicer-core",), False),
+    (("numpy",), "every command"),
+    (("vtk", "slicer-core"), "every command"),
+    (("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless"), "every command"),
+    (("onnxruntime", "onnxruntime-gpu"), "register"),
+    (("torch",), "synthesize and train"),
+    (("safetensors",), "synthesize and train"),
+    (("onnx",), "train"),
+    (("scikit-image",), "demo and synthesize"),
+    (("matplotlib",), "evaluate"),
+    (("jinja2",), "evaluate and demo"),
+    (("slicer-core",), ""),
 )
 CPU_FEATURES = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_tile", "amx_bf16", "amx_int8")
 WEIGHTS_FOLDER = Path(__file__).parents[1] / "appearances" / "weights"
@@ -112,7 +111,7 @@ def make_report() -> dict:
 
 def _packages() -> tuple[dict[str, str | None], list[str]]:
     versions, problems = {}, []
-    for names, needed in PACKAGES:
+    for names, needed_by in PACKAGES:
         found = {}
         for name in names:
             try:
@@ -120,8 +119,8 @@ def _packages() -> tuple[dict[str, str | None], list[str]]:
             except metadata.PackageNotFoundError:
                 continue
         versions.update(found or {names[0]: None})
-        if needed and not found:
-            problems.append(f"the package {names[0]} is not installed; run: pip install {names[0]}")
+        if needed_by and not found:
+            problems.append(f"{names[0]} is not installed, {needed_by} cannot work; run: pip install {names[0]}")
     return versions, problems
 
 
