@@ -1,0 +1,234 @@
+"""Compare predicted poses with known ones: metrics.json, curves, overlays and a report, in one folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .. import files
+from ..case.case import Case
+from ..errors import InputError, Problems
+from ..geometry.camera import Camera
+from ..registration.poses_file import Frame, read_poses, write_poses
+from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics
+
+ProgressFunction = Callable[[float, str], None]
+NEEDED_MB = 50.0
+OVERLAY_COUNT = 12
+_SHOWN_SIDE_PX = 512  # overlays of small frames are drawn at about this size, so that outlines stay thin
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The pairs that were compared (same order) and what came out. camera is that of the frames."""
+
+    camera: Camera
+    true: list[Frame]
+    predicted: list[Frame]
+    errors: FrameErrors
+    metrics: dict
+
+    @property
+    def styles(self) -> list[str | None]:
+        return [frame.style for frame in self.true]
+
+
+def evaluate(
+    case: Case,
+    poses_path: Path,
+    out_folder: Path,
+    styles: Sequence[str] | None = None,
+    predicted_path: Path | None = None,
+    progress: ProgressFunction = lambda _fraction, _message: None,
+    predictor=None,
+) -> Evaluation:
+    """Register the frames of `poses_path`, whose poses are known, with the case's model, and write the comparison.
+
+    styles: only frames of these. predicted_path: compare this poses file instead of running the model. predictor: used
+    in place of the case's own. Writes metrics.json, predicted.json, curves.png, styles.png, overlays/*.png,
+    overlays.png and report.html into out_folder. Raises InputError with all problems before anything is registered.
+    """
+    out_folder = Path(out_folder).absolute()
+    problems = Problems()
+    camera, true, predicted = case.camera, [], None
+    with problems.collect():
+        _check_out(out_folder)
+    with problems.collect():
+        camera, true = _known_frames(Path(poses_path), styles, case.camera)
+    if predicted_path is not None:
+        with problems.collect():
+            predicted = _pair(true, Path(predicted_path))
+    elif predictor is None:
+        with problems.collect():
+            from ..registration.predictor import Predictor
+
+            predictor = Predictor(case.model_folder)
+    problems.raise_if_any()
+
+    if predicted is None:
+        predicted = _register(true, camera, predictor, progress)
+    evaluation = compare(case, camera, true, predicted)
+    _write(case, evaluation, out_folder, progress)
+    return evaluation
+
+
+def compare(case: Case, camera: Camera, true: list[Frame], predicted: list[Frame]) -> Evaluation:
+    """Errors and metrics of paired frames, with the mean-pose baseline and the latency where it is known."""
+    vertices_mm = case.vessels.vertices_mm
+    true_poses = np.array([frame.camera_from_world for frame in true])
+    poses, accepted = [frame.camera_from_world for frame in predicted], [frame.accepted for frame in predicted]
+    errors = frame_errors(vertices_mm, true_poses, poses, accepted)
+    result = metrics(errors, [frame.style for frame in true])
+    baseline = np.broadcast_to(mean_pose(vertices_mm, true_poses), true_poses.shape)
+    result["mean_pose_add_mm"] = float(add_mm(vertices_mm, true_poses, baseline).mean())
+    latency_ms = [frame.extra["latency_ms"] for frame in predicted if "latency_ms" in frame.extra]
+    if latency_ms:
+        median, p95 = np.percentile(latency_ms, (50, 95))
+        result["latency_ms"] = {"median": float(median), "p95": float(p95)}
+    return Evaluation(camera, true, predicted, errors, result)
+
+
+def _check_out(folder: Path) -> None:
+    """Raise InputError when `folder` cannot be made or written; makes nothing."""
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(f"{existing}: is a file; give --out the name of a folder.")
+    if not os.access(existing, os.W_OK):
+        raise InputError(f"{existing}: nothing can be written here; choose a folder you may write to.")
+    files.require_space(folder, NEEDED_MB)
+
+
+def _known_frames(path: Path, styles: Sequence[str] | None, case_camera: Camera) -> tuple[Camera, list[Frame]]:
+    """Camera and frames of the wanted styles, all with a pose and an image. Raises InputError."""
+    camera, frames = read_poses(path)
+    problems = Problems()
+    if styles:
+        known = {frame.style for frame in frames}
+        listed = ", ".join(sorted(style for style in known if style is not None)) or "none"
+        for style in sorted(set(styles) - known):
+            problems.add(f"{path}: has no frames of style '{style}'; its styles are: {listed}.")
+        frames = [frame for frame in frames if frame.style in styles]
+    for frame in frames:
+        if frame.camera_from_world is None:
+            problems.add(f"{path}: {frame.image.name} has no camera_from_world; evaluation needs the known pose.")
+        if not frame.image.is_file():
+            problems.add(f"{frame.image}: image not found; {path.name} names it relative to its own folder.")
+    problems.raise_if_any()
+    return camera or case_camera, frames
+
+
+def _pair(true: Iterable[Frame], path: Path) -> list[Frame]:
+    """The frames of `path` with the images of `true`, in that order. Raises InputError naming those that lack."""
+    by_image = {frame.image: frame for frame in read_poses(path)[1]}
+    problems = Problems()
+    for frame in true:
+        if frame.image not in by_image:
+            problems.add(f"{path}: has no frame for {frame.image}; register it too, or choose --styles.")
+    problems.raise_if_any()
+    return [by_image[frame.image] for frame in true]
+
+
+def _register(true: list[Frame], camera: Camera, predictor, progress: ProgressFunction) -> list[Frame]:
+    predicted, problems = [], Problems()
+    for i, frame in enumerate(true):
+        with problems.collect():
+            prediction = predictor.predict(files.read_image_rgb(frame.image), camera)
+            extra = {
+                "accepted": bool(prediction.accepted),
+                "confidence": float(prediction.confidence),
+                "latency_ms": float(prediction.latency_ms),
+            }
+            predicted.append(Frame(frame.image, prediction.camera_from_world, frame.style, extra))
+        progress(0.8 * (i + 1) / len(true), f"Registering frames: {i + 1} of {len(true)}")
+    problems.raise_if_any()
+    return predicted
+
+
+def _write(case: Case, evaluation: Evaluation, folder: Path, progress: ProgressFunction) -> None:
+    from .curves import curve_points, write_curves, write_style_bars
+    from .report import write_report
+
+    errors, styles = evaluation.errors, evaluation.styles
+    write_poses(folder / "predicted.json", evaluation.camera, _with_errors(evaluation))
+    # A copy of the curves' points in numbers: a plot cannot be compared.
+    files.write_json(folder / "metrics.json", evaluation.metrics | {"curves": curve_points(errors)})
+    progress(0.85, "Drawing the curves")
+    write_curves(folder / "curves.png", errors, styles)
+    write_style_bars(folder / "styles.png", evaluation.metrics)
+    progress(0.9, "Drawing the overlays")
+    _write_overlays(case, evaluation, folder)
+    write_report(folder, case.folder.name, evaluation)
+    progress(1.0, f"Report: {folder / 'report.html'}")
+
+
+def _with_errors(evaluation: Evaluation) -> list[dict]:
+    """The predicted frames, with the style of the known ones and each frame's errors (None without a pose)."""
+    entries = []
+    for i, (true, frame) in enumerate(zip(evaluation.true, evaluation.predicted)):
+        values = {name: getattr(evaluation.errors, name)[i] for name in ("add_mm", "rotation_deg", "translation_mm")}
+        known = {name: None if np.isnan(value) else round(float(value), 4) for name, value in values.items()}
+        style = {} if true.style is None else {"style": true.style}
+        entries.append(frame.to_dict() | {"accepted": frame.accepted, "errors": known} | style)
+    return entries
+
+
+def _write_overlays(case: Case, evaluation: Evaluation, folder: Path) -> None:
+    from .overlays import choose_frames, sheet
+
+    chosen = choose_frames(evaluation.errors.add_mm, evaluation.styles, OVERLAY_COUNT)
+    for old in (folder / "overlays").glob("*.png"):
+        old.unlink()  # of an earlier run: they would pass for this one's
+    tiles = []
+    for rank, (index, tile) in enumerate(zip(chosen, overlay_images(case, evaluation, chosen))):
+        style = f"{evaluation.true[index].style}_" if evaluation.true[index].style else ""
+        files.write_png(folder / "overlays" / f"{rank:02d}_{style}{evaluation.true[index].image.stem}.png", tile)
+        tiles.append(tile)
+    files.write_png(folder / "overlays.png", sheet(tiles))
+
+
+def overlay_images(case: Case, evaluation: Evaluation, indices: Iterable[int]) -> list[np.ndarray]:
+    """uint8 RGB images with the true (green) and the predicted (blue) outline, captioned, for frames by index."""
+    import cv2
+
+    from ..masks.renderer import MaskRenderer
+    from ..poses.craniotomy import disc_under_vessels, find_craniotomy
+    from .overlays import draw_overlay, undistorted, with_caption
+
+    parenchyma = case.cortex or disc_under_vessels(
+        case.vessels, find_craniotomy(case.vessels, None, case.space).outward_axis
+    )
+    renderers: dict[Camera, MaskRenderer] = {}
+    results = []
+    try:
+        for index in indices:
+            true, predicted = evaluation.true[index], evaluation.predicted[index]
+            image = files.read_image_rgb(true.image)
+            height, width = image.shape[:2]
+            scale = max(1, round(_SHOWN_SIDE_PX / min(height, width)))
+            image = undistorted(image, evaluation.camera.resized(width, height))
+            image = cv2.resize(image, (width * scale, height * scale), interpolation=cv2.INTER_CUBIC)
+            camera = evaluation.camera.resized(width * scale, height * scale)
+            if camera not in renderers:
+                renderers[camera] = MaskRenderer(case.vessels, parenchyma, camera)
+            pose = predicted.camera_from_world
+            labels = [None if p is None else renderers[camera].render(p) for p in (true.camera_from_world, pose)]
+            results.append(with_caption(draw_overlay(image, *labels), _caption(evaluation, index)))
+    finally:
+        for renderer in renderers.values():
+            renderer.close()
+    return results
+
+
+def _caption(evaluation: Evaluation, index: int) -> str:
+    true, predicted, errors = evaluation.true[index], evaluation.predicted[index], evaluation.errors
+    name = f"{true.style}/{true.image.stem}" if true.style else true.image.stem
+    if predicted.camera_from_world is None:
+        return f"{name}: refused, no pose"
+    refused = "" if predicted.accepted else " (refused)"
+    return f"{name}: ADD {errors.add_mm[index]:.2f} mm, {errors.rotation_deg[index]:.1f} deg{refused}"
