@@ -114,7 +114,7 @@ def test_cortex_far_from_vessels(tmp_path, inputs, centre_mm, words):
 
 def test_vessels_that_could_never_be_in_view(tmp_path, inputs):
     narrow = Camera.from_field_of_view(640, 480, 4.0, 300.0)
-    with pytest.raises(InputError, match=r"vessels\.vtp: the vessels \(42 mm across\) could never be in view"):
+    with pytest.raises(InputError, match=r"vessels\.vtp: the vessels \(43 mm across\) could never be in view"):
         Case.create(tmp_path / "case", inputs["vessels"], None, narrow)
 
 

@@ -40,6 +40,10 @@ UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 2 bad input, 3 cancelled, 1 anything else."""
     argv = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that cannot show a character of a path must not end the run.
+        with contextlib.suppress(AttributeError):
+            stream.reconfigure(errors="backslashreplace")
     try:
         args = _build_parser(argv).parse_args(argv)
     except SystemExit as exit_request:  # argparse has printed its text
@@ -149,6 +153,4 @@ def _say_problems(command: str, problems: list[str]) -> None:
 
 
 def _say(text: str) -> None:
-    # A terminal that cannot show a character of a path must not hide the message.
-    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-    print(text.encode(encoding, "backslashreplace").decode(encoding), file=sys.stderr, flush=True)
+    print(text, file=sys.stderr, flush=True)
