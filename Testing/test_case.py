@@ -13,7 +13,7 @@ import pytest
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
+from ExpectedAppearancesLib.case.meshes import Mesh, declared_space, write_vtp
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import Camera, write_camera
 
@@ -54,6 +54,7 @@ def test_a_new_case_opens_with_what_went_in_even_after_it_moved(tmp_path, inputs
     (tmp_path / "Fall ä").rename(tmp_path / "moved")
     case = Case.open(tmp_path / "moved")
     assert case.space == "RAS" and case.camera == CAMERA
+    assert declared_space(tmp_path / "moved" / "cortex.vtp") == "RAS"  # so that 3D Slicer loads it as RAS
     assert np.array_equal(case.vessels.vertices_mm, patch(30.0).vertices_mm)
     assert np.array_equal(case.cortex.triangles, patch(60.0).triangles)
     assert case.poses_path == tmp_path / "moved" / "poses" / "poses.json"

@@ -158,5 +158,25 @@ def test_space_is_read_from_the_header(tmp_path):
         writer.SetFileName(str(path))
         writer.Write()
         assert declared_space(path) == space
+        write_vtp(tmp_path / f"{space}.vtp", Mesh.from_polydata(sphere()), space)
+        assert declared_space(tmp_path / f"{space}.vtp") == space
     assert declared_space(save(sphere(), tmp_path / "plain.vtk")) is None
-    assert declared_space(tmp_path / "none.vtk") is None
+    assert declared_space(save(sphere(), tmp_path / "plain.vtp")) is None
+    assert declared_space(tmp_path / "none.vtp") is None
+
+
+def test_3d_slicer_reads_the_space_that_was_written(tmp_path):
+    """slicer-core loads a RAS file as it is and turns an LPS file into its own RAS."""
+    slicer = pytest.importorskip("slicer", reason="slicer-core is not installed")
+    if not hasattr(slicer, "vtkMRMLModelStorageNode"):
+        pytest.skip("this slicer package has no MRML")
+    for space, x_mm in (("RAS", 30.0), ("LPS", -30.0)):
+        write_vtp(tmp_path / "a.vtp", Mesh.from_polydata(sphere()), space)
+        node, storage = slicer.vtkMRMLModelNode(), slicer.vtkMRMLModelStorageNode()
+        storage.SetFileName(str(tmp_path / "a.vtp"))
+        assert storage.ReadData(node)
+        assert Mesh.from_polydata(node.GetPolyData()).centroid_mm[0] == pytest.approx(x_mm, abs=1e-3)
+        storage.SetFileName(str(tmp_path / "b.vtp"))
+        storage.SetCoordinateSystem(storage.CoordinateSystemRAS)
+        assert storage.WriteData(node)
+        assert declared_space(tmp_path / "b.vtp") == "RAS"

@@ -77,35 +77,16 @@ class Case:
         Everything is checked first; raises InputError with all problems. The folder appears whole or not at all.
         """
         folder = Path(folder).absolute()
-        problems = Problems()
-        _check_new_folder(folder, problems)
-        if space not in SPACES:
-            problems.add(f"space: '{space}' is not known; give LPS (most files, and 3D Slicer's) or RAS.")
-        camera = vessels = cortex = None
-        with problems.collect():
-            vessels = read_mesh(vessels_path, "vessel mesh")
-        with problems.collect():
-            cortex = read_mesh(cortex_path, "cortex mesh") if cortex_path else None
-        with problems.collect():
-            camera = camera_path if isinstance(camera_path, Camera) else read_camera(camera_path)
-        sources = {"vessels": vessels_path, "cortex": cortex_path if cortex else None}
-        for source in filter(None, sources.values()):
-            declared = declared_space(source)
-            if declared and declared != space:
-                problems.add(f"{source}: says that its space is {declared}, not {space}; give --space {declared}.")
-        if vessels and camera:
-            _check_view(vessels, camera, vessels_path, problems)
-        if vessels and cortex:
-            _check_distance(vessels, cortex, vessels_path, cortex_path, problems)
-        problems.raise_if_any()
-
+        vessels, cortex, camera = Case.check_inputs(folder, vessels_path, cortex_path, camera_path, space)
+        sources = {"vessels": vessels_path, "cortex": cortex_path}
         part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+        shutil.rmtree(part, ignore_errors=True)  # of a killed run that had the same process id
         try:
             part.mkdir(parents=True)
             inputs = {}
             for name, mesh in (("vessels", vessels), ("cortex", cortex)):
                 if mesh:
-                    write_vtp(part / f"{name}.vtp", mesh)
+                    write_vtp(part / f"{name}.vtp", mesh, space)
                     inputs[name] = _input_entry(part / f"{name}.vtp", sources[name])
             write_camera(part / "camera.json", camera)
             inputs["camera"] = _input_entry(
@@ -134,6 +115,36 @@ class Case:
         finally:
             shutil.rmtree(part, ignore_errors=True)
         return Case(folder, manifest, camera)
+
+    @staticmethod
+    def check_inputs(
+        folder: Path, vessels_path: Path, cortex_path: Path | None, camera_path: Path | Camera | None, space: str
+    ) -> tuple[Mesh, Mesh | None, Camera | None]:
+        """What `create` checks before it writes anything. Raises InputError with all problems."""
+        problems = Problems()
+        _check_new_folder(Path(folder).absolute(), problems)
+        if space not in SPACES:
+            problems.add(f"space: '{space}' is not known; give LPS (most files, and 3D Slicer's) or RAS.")
+        camera = vessels = cortex = None
+        with problems.collect():
+            vessels = read_mesh(vessels_path, "vessel mesh")
+        with problems.collect():
+            cortex = read_mesh(cortex_path, "cortex mesh") if cortex_path else None
+        with problems.collect():
+            if isinstance(camera_path, Camera):
+                camera = Camera.from_dict(camera_path.to_dict())
+            elif camera_path is not None:
+                camera = read_camera(camera_path)
+        for source in filter(None, (vessels_path, cortex_path)):
+            declared = declared_space(source)
+            if declared and declared != space:
+                problems.add(f"{source}: says that its space is {declared}, not {space}; give --space {declared}.")
+        if vessels and camera:
+            _check_view(vessels, camera, vessels_path, problems)
+        if vessels and cortex:
+            _check_distance(vessels, cortex, vessels_path, cortex_path, problems)
+        problems.raise_if_any()
+        return vessels, cortex, camera
 
     @staticmethod
     def open(folder: Path) -> Case:

@@ -16,6 +16,7 @@ SMALLEST_EXTENT_MM = 1.0
 LARGEST_EXTENT_MM = 2000.0
 PLY_TYPES = dict(char="b", uchar="B", short="h", ushort="H", int="i", uint="I", float="f", double="d")
 PLY_TYPES |= dict(int8="b", uint8="B", int16="h", uint16="H", int32="i", uint32="I", float32="f", float64="d")
+SPACE_FIELD = "SPACE"
 FORMATS = (".vtp", ".vtk", ".stl", ".ply", ".obj")
 
 
@@ -125,12 +126,22 @@ def read_mesh(path: Path, what: str) -> Mesh:
     return mesh
 
 
-def write_vtp(path: Path, mesh: Mesh) -> None:
-    """Write `mesh` with point normals as VTK XML, whole or not at all. Raises InputError when it cannot."""
+def write_vtp(path: Path, mesh: Mesh, space: str | None = None) -> None:
+    """Write `mesh` with point normals as VTK XML, whole or not at all. Raises InputError when it cannot.
+
+    `space` ('LPS' or 'RAS') is written where 3D Slicer looks for it; without it Slicer takes LPS.
+    """
+    from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
+    polydata = mesh.to_polydata()
+    if space:
+        array = vtkStringArray()
+        array.SetName(SPACE_FIELD)
+        array.InsertNextValue(space)
+        polydata.GetFieldData().AddArray(array)
     writer = vtkXMLPolyDataWriter()
-    writer.SetInputData(mesh.to_polydata())
+    writer.SetInputData(polydata)
     # To memory: VTK reports a full disk only on the terminal. Base64 keeps the text ASCII.
     writer.SetDataModeToBinary()
     writer.WriteToOutputStringOn()
@@ -139,13 +150,18 @@ def write_vtp(path: Path, mesh: Mesh) -> None:
 
 
 def declared_space(path: Path) -> str | None:
-    """'LPS' or 'RAS' where the file says so in its header, as those that 3D Slicer writes do; else None."""
+    """'LPS' or 'RAS' where the file says so as 3D Slicer does, in its header or (.vtp) its field data; else None."""
+    path = Path(path)
     try:
         with open(path, "rb") as stream:
             found = re.search(rb"SPACE=(LPS|RAS)", stream.read(2048))
-    except OSError:
+        if found:
+            return found.group(1).decode()
+        array = _read_polydata(path).GetFieldData().GetAbstractArray(SPACE_FIELD) if path.suffix == ".vtp" else None
+    except (OSError, InputError):  # read_mesh reports these
         return None
-    return found.group(1).decode() if found else None
+    value = array.GetValue(0) if array and array.IsA("vtkStringArray") and array.GetNumberOfValues() else None
+    return value if value in ("LPS", "RAS") else None
 
 
 def _read_polydata(path: Path):
