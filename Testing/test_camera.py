@@ -122,6 +122,7 @@ def test_all_problems_of_a_camera_are_reported_at_once(tmp_path):
         ({"cy": -3.0}, "principal point"),
         ({"fx": 35.0}, "in px, not mm"),
         ({"fy": float("nan")}, "not a number"),
+        ({"distortion": [0.1, float("nan"), 0.0, 0.0]}, "'distortion' must be a list of numbers"),
     ],
 )
 def test_intrinsics_that_do_not_fit_the_image(change, words):

@@ -98,6 +98,8 @@ class Camera:
         distortion = values.get("distortion") or []
         try:
             distortion = tuple(float(d) for d in distortion)
+            if not all(map(math.isfinite, distortion)):
+                raise ValueError
         except (TypeError, ValueError):
             problems.add(f"{source}: 'distortion' must be a list of numbers in OpenCV's order.")
             distortion = ()
