@@ -53,6 +53,13 @@ def test_one_stop_doubles_the_light():
     np.testing.assert_allclose(looked(image=image, exposure_stops=(1, 1)), 120, atol=1)
 
 
+def test_contrast_is_stretched_about_the_mean():
+    image = np.full((16, 16, 3), 100, np.uint8)
+    image[8:] = 140
+    result = looked(image=image, contrast=(1.5, 1.5))
+    assert (result[0, 0, 0], result[15, 0, 0]) == (90, 150)
+
+
 def test_gamma_is_the_power_of_the_relative_value():
     image = np.full((16, 16, 3), 64, np.uint8)
     np.testing.assert_allclose(looked(image=image, gamma=(2, 2)), 255 * (64 / 255) ** 2, atol=1)

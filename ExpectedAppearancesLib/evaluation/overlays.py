@@ -29,18 +29,19 @@ def draw_overlay(
 ) -> np.ndarray:
     """Copy of a uint8 RGB frame (H, W, 3) with the vessels' outlines of the label maps (H, W); None draws nothing.
 
-    thickness_px: 0 chooses one for the size. Raises ValueError when the sizes differ.
+    thickness_px: of the predicted outline; 0 chooses one for the size. Raises ValueError when the sizes differ.
     """
     result = image.copy()
-    thickness_px = thickness_px or max(1, round(min(image.shape[:2]) / 300))
-    for labels, colour in ((true_labels, TRUE_RGB), (predicted_labels, PREDICTED_RGB)):
+    thin = thickness_px or max(1, round(min(image.shape[:2]) / 256))
+    # The true outline is wider, so that it still shows where the predicted one covers it.
+    for labels, colour, width_px in ((true_labels, TRUE_RGB, thin + 1), (predicted_labels, PREDICTED_RGB, thin)):
         if labels is None:
             continue
         if labels.shape != image.shape[:2]:
             raise ValueError(f"label map {labels.shape} does not fit image {image.shape}")
         vessels = (labels == VESSELS).astype(np.uint8)
         contours = cv2.findContours(vessels, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-        cv2.drawContours(result, contours, -1, colour, thickness_px, cv2.LINE_AA)
+        cv2.drawContours(result, contours, -1, colour, width_px, cv2.LINE_AA)
     return result
 
 
@@ -97,20 +98,25 @@ def sheet(tiles: Sequence[np.ndarray], columns: int = 4, gap_px: int = 6) -> np.
 
 
 def choose_frames(error: np.ndarray, styles: Sequence[str | None], count: int = 12) -> list[int]:
-    """Indices of `count` frames from the best to the worst error (N,), NaN last, spread over the styles.
+    """Indices of `count` frames from the best to the worst error (N,), spread over the styles.
 
-    Evenly spaced ranks, the best, the median's neighbours and the worst included; within a small window of each rank
-    the style that was shown least is taken, except at the two ends.
+    Evenly spaced ranks, the best and the worst included; within a small window of each rank the style that was shown
+    least is taken, except at the two ends. Where frames have no error (NaN: no pose), one of them comes last.
     """
-    order = np.argsort(np.where(np.isnan(error), np.inf, error), kind="stable")
-    count = min(count, len(order))
+    order = np.argsort(error, kind="stable")  # NaN last
+    known = order[: int((~np.isnan(error)).sum())]
+    chosen = _spread(known, styles, min(count - 1 if len(known) < len(order) else count, len(known)))
+    return chosen + order[len(known) :][: min(1, count - len(chosen))].tolist()
+
+
+def _spread(order: np.ndarray, styles: Sequence[str | None], count: int) -> list[int]:
     shown = dict.fromkeys(styles, 0)
     chosen: list[int] = []
-    reach = len(order) // (4 * count) if count else 0
+    reach = len(order) // (4 * count) if count else 0  # less than half a step: windows share no frame
     for position, rank in enumerate(np.linspace(0, len(order) - 1, count).round().astype(int)):
         ends = position in (0, count - 1)
-        window = order[[rank]] if ends else order[max(rank - reach, 0) : rank + reach + 1]
-        index = min((int(i) for i in window if int(i) not in chosen), key=lambda i: shown[styles[i]])
+        window = order[[rank]] if ends else order[rank - reach : rank + reach + 1]
+        index = min(window.tolist(), key=lambda i: shown[styles[i]])
         shown[styles[index]] += 1
         chosen.append(index)
     return chosen

@@ -78,7 +78,7 @@ def write_report(folder: Path, case_name: str, evaluation) -> None:
         without_pose=result["without_pose"],
         curves=_embedded(folder / "curves.png"),
         by_style=_embedded(folder / "styles.png") if len(result["styles"]) > 1 else "",
-        overlays=_embedded(folder / "overlays.png"),
+        overlays=_embedded_photograph(folder / "overlays.png"),
     )
     files.write_bytes(folder / "report.html", html.encode("utf-8"))
 
@@ -132,3 +132,11 @@ def _cells(values: dict) -> list[str]:
 
 def _embedded(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def _embedded_photograph(path: Path) -> str:
+    """As JPEG: a sheet of frames is several MB as PNG, too much for a report that is sent by mail."""
+    import cv2
+
+    image = cv2.imencode(".jpg", files.read_image_rgb(path)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(image.tobytes()).decode("ascii")
