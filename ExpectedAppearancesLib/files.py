@@ -29,7 +29,8 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space or choose a folder you may write to."
+            f"{path}: cannot be written ({error.strerror or error}); "
+            "free some space or choose a folder you may write to."
         ) from error
     finally:
         with contextlib.suppress(OSError):
@@ -87,7 +88,8 @@ def read_label_map(path: Path) -> np.ndarray:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: label map not found; check the path.")
-    labels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    labels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if labels is None:
         raise InputError(f"{path}: label map cannot be read (or damaged); save it as an 8-bit grey PNG.")
     if labels.ndim == 3:

@@ -104,7 +104,9 @@ class Camera:
             problems.add(f"{source}: 'distortion' must be a list of numbers in OpenCV's order.")
             distortion = ()
         if distortion and len(distortion) not in DISTORTION_LENGTHS:
-            problems.add(f"{source}: 'distortion' has {len(distortion)} numbers; OpenCV's models have {DISTORTION_LENGTHS}.")
+            problems.add(
+                f"{source}: 'distortion' has {len(distortion)} numbers; OpenCV's models have {DISTORTION_LENGTHS}."
+            )
         for key in ("width", "height", "fx", "fy"):
             if numbers.get(key, 1) <= 0:
                 problems.add(f"{source}: '{key}' is {numbers[key]}; it must be above 0 px.")
@@ -158,9 +160,13 @@ def _read_opencv_calibration(path: Path) -> Camera:
         distortion = storage.getNode("distortion_coefficients").mat()
         width, height = (storage.getNode(key).real() for key in ("image_width", "image_height"))
     except (cv2.error, SystemError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not an OpenCV calibration file ({error}); save it with OpenCV's calibration.") from error
+        raise InputError(
+            f"{path}: not an OpenCV calibration file ({error}); save it with OpenCV's calibration."
+        ) from error
     if matrix is None or matrix.shape != (3, 3):
         raise InputError(f"{path}: 'camera_matrix' (3x3) is missing; save it with OpenCV's calibration.")
     values = {"width": int(width), "height": int(height), "fx": matrix[0, 0], "fy": matrix[1, 1]}
-    values |= {"cx": matrix[0, 2], "cy": matrix[1, 2], "distortion": [] if distortion is None else distortion.ravel().tolist()}
-    return Camera.from_dict({k: float(v) if k != "distortion" else v for k, v in values.items()}, str(path))
+    values |= {"cx": matrix[0, 2], "cy": matrix[1, 2]}
+    values = {key: float(value) for key, value in values.items()}
+    values["distortion"] = [] if distortion is None else distortion.ravel().tolist()
+    return Camera.from_dict(values, str(path))
