@@ -14,6 +14,7 @@ from ..case.case import Case
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera
 from ..registration.poses_file import Frame, read_poses, write_poses
+from ..registration.record import frame_record
 from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics
 
 ProgressFunction = Callable[[float, str], None]
@@ -139,11 +140,8 @@ def _register(true: list[Frame], camera: Camera, predictor, progress: ProgressFu
     for i, frame in enumerate(true):
         with problems.collect():
             prediction = predictor.predict(files.read_image_rgb(frame.image), camera)
-            extra = {
-                "accepted": bool(prediction.accepted),
-                "confidence": float(prediction.confidence),
-                "latency_ms": float(prediction.latency_ms),
-            }
+            record = frame_record(frame.image, prediction)
+            extra = {key: value for key, value in record.items() if key not in ("image", "camera_from_world")}
             predicted.append(Frame(frame.image, prediction.camera_from_world, frame.style, extra))
         progress(0.8 * (i + 1) / len(true), f"Registering frames: {i + 1} of {len(true)}")
     problems.raise_if_any()

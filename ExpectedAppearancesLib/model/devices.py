@@ -1,0 +1,14 @@
+"""Where training and synthesis compute."""
+
+from __future__ import annotations
+
+import torch
+
+from ..errors import InputError
+
+
+def choose_device(name: str) -> torch.device:
+    """'auto', 'cpu' or 'cuda' -> torch.device. Raises InputError when CUDA is asked for and not usable."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("device: no CUDA device is usable here; choose --device cpu or auto (see `check`).")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

@@ -1,0 +1,127 @@
+"""Batches of training views from a process of its own.
+
+Rendering and training are kept apart: loading all of VTK and torch's optimisers into one process has crashed, and two
+processes use two cores.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .views import ViewSettings
+
+QUEUE_BATCHES = 6
+TIMEOUT_S = 300.0
+
+
+@dataclass(frozen=True)
+class Batch:
+    """images uint8 (B, S, S, 3); camera_from_world (B, 4, 4); points_mm float32 (B, G, G, 3); surface, vessels (B, G, G)."""
+
+    images: np.ndarray
+    camera_from_world: np.ndarray
+    points_mm: np.ndarray
+    surface: np.ndarray
+    vessels: np.ndarray
+
+
+class Feeder:
+    """Yields the batches of views first, first + size, ... in order. A context manager: leaving it ends the process."""
+
+    def __init__(self, case_folder: Path, settings: ViewSettings, batch: int, first_batch: int = 0):
+        context = multiprocessing.get_context("spawn")
+        self._queue = context.Queue(QUEUE_BATCHES)
+        self._process = context.Process(
+            target=_serve, args=(str(case_folder), settings, batch, first_batch, self._queue, os.getpid()), daemon=True
+        )
+
+    def __enter__(self) -> Feeder:
+        self._process.start()
+        return self
+
+    def __exit__(self, *_error) -> None:
+        self._process.terminate()
+        self._process.join(10)
+        self._queue.cancel_join_thread()
+        self._queue.close()
+
+    def next(self) -> Batch:
+        """The next batch. Raises RuntimeError with the other process's traceback when it failed."""
+        for _ in range(int(TIMEOUT_S)):
+            try:
+                item = self._queue.get(timeout=1.0)
+            except queue.Empty:
+                if self._process.is_alive():
+                    continue
+                raise RuntimeError(f"rendering of training views ended (exit code {self._process.exitcode})") from None
+            if isinstance(item, str):
+                raise RuntimeError(f"rendering of training views failed:\n{item}")
+            return Batch(*item)
+        raise RuntimeError(f"no training view was rendered in {TIMEOUT_S:.0f} s")
+
+
+class ViewMemory:
+    """Batches that mix new views with ones seen before; what comes out depends only on the seed and the step."""
+
+    def __init__(self, feeder: Feeder, batch: int, remembered: int, seed: int):
+        self._feeder, self._batch, self._remembered, self._seed = feeder, batch, remembered, seed
+        self._views: list[tuple[np.ndarray, ...]] = []
+        self.drawn = 0  # batches taken from the feeder
+
+    def next(self, step: int) -> Batch:
+        fresh = self._draw()
+        while len(self._views) + len(fresh) < self._batch:
+            self._views += fresh
+            fresh = self._draw()
+        rng = np.random.default_rng([self._seed, step])
+        again = rng.choice(len(self._views), self._batch - len(fresh), replace=False) if self._views else []
+        chosen = fresh + [self._views[i] for i in again]
+        if len(fresh) < self._batch:
+            self._views = (self._views + fresh)[-self._remembered :]
+        return Batch(*(np.stack(parts) for parts in zip(*chosen, strict=True)))
+
+    def _draw(self) -> list[tuple[np.ndarray, ...]]:
+        self.drawn += 1
+        batch = self._feeder.next()
+        return list(zip(*vars(batch).values(), strict=True))
+
+
+def draw_views(case_folder: Path, settings: ViewSettings, count: int) -> Batch:
+    """Views 0 ... count - 1 at once, through a feeder."""
+    with Feeder(case_folder, settings, count) as feeder:
+        return feeder.next()
+
+
+def _serve(case_folder: str, settings: ViewSettings, batch: int, first_batch: int, out, parent: int) -> None:
+    try:
+        os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's rasteriser: the other cores are for training
+        import cv2
+
+        from .views import ViewSource
+
+        cv2.setNumThreads(1)
+        source = ViewSource(Path(case_folder), settings)
+        number = first_batch
+        while os.getppid() == parent:  # an orphan would render for nobody
+            views = [source.view(number * batch + i) for i in range(batch)]
+            out.put(
+                (
+                    np.stack([v.image for v in views]),
+                    np.stack([v.camera_from_world for v in views]),
+                    np.stack([v.points_mm for v in views]),
+                    np.stack([v.surface for v in views]),
+                    np.stack([v.vessels for v in views]),
+                )
+            )
+            number += 1
+    except KeyboardInterrupt:
+        pass
+    except BaseException:  # the training process must learn of it, whatever it is
+        out.put(traceback.format_exc())

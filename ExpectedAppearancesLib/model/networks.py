@@ -1,0 +1,83 @@
+"""The networks of P_Omega. All take RGB (B, 3, S, S) in 0..1 and know nothing of cameras or millimetres."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+
+class PaperRegressor(nn.Module):
+    """The paper's P_Omega: three blocks of (conv, conv, ReLU), average pooling after all but the last, then 128-64-32-6."""
+
+    def __init__(self, size_px: int, channels: tuple[int, int, int] = (16, 32, 64)):
+        super().__init__()
+        layers, previous = [], 3
+        for i, width in enumerate(channels):
+            layers += [nn.Conv2d(previous, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1), nn.ReLU()]
+            layers += [nn.AvgPool2d(2)] if i < len(channels) - 1 else []
+            previous = width
+        self.features = nn.Sequential(*layers)
+        side = size_px // 4
+        self.head = nn.Sequential(
+            nn.Linear(previous * side * side, 128),
+            nn.ReLU(),
+            nn.Linear(128, 64),
+            nn.ReLU(),
+            nn.Linear(64, 32),
+            nn.ReLU(),
+            nn.Linear(32, 6),
+        )
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """-> (B, 6): rotation vector relative to the case's reference (rad), scaled translation."""
+        return self.head(self.features(image - 0.5).flatten(1))
+
+
+def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()
+    )
+
+
+class DenseSurfaceNet(nn.Module):
+    """U-Net that tells, for each cell of a grid half the input's size, which point of the surface it sees.
+
+    -> (B, 6, S/2, S/2): surface coordinates in units of the case's scale (3), log of their scale of error (1),
+    logit of "the case's surface is here" (1), logit of "vessel" (1).
+    """
+
+    def __init__(self, width: float = 1.0):
+        super().__init__()
+        c = [8 * round(width * n / 8) for n in (24, 48, 96, 160, 224)]
+        self.stem = _block(3, c[0])
+        self.down1 = nn.Sequential(_block(c[0], c[1], 2), _block(c[1], c[1]))
+        self.down2 = nn.Sequential(_block(c[1], c[2], 2), _block(c[2], c[2]))
+        self.down3 = nn.Sequential(_block(c[2], c[3], 2), _block(c[3], c[3]))
+        self.down4 = nn.Sequential(_block(c[3], c[4], 2), _block(c[4], c[4]))
+        self.context = nn.Linear(c[4], c[4])
+        self.bottom = _block(c[4], c[4])
+        self.up3 = _block(c[4] + c[3], c[3])
+        self.up2 = _block(c[3] + c[2], c[2])
+        self.up1 = nn.Sequential(_block(c[2] + c[1], c[1]), _block(c[1], c[1]))
+        self.head = nn.Conv2d(c[1], 6, 1)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        x1 = self.down1(self.stem(image - 0.5))
+        x2 = self.down2(x1)
+        x3 = self.down3(x2)
+        x4 = self.down4(x3)
+        # What lies where depends on the whole view: its mean is given to every cell.
+        x4 = self.bottom(x4 + self.context(x4.mean(dim=(2, 3)))[:, :, None, None])
+        x = self.up3(torch.cat([_twice(x4), x3], dim=1))
+        x = self.up2(torch.cat([_twice(x), x2], dim=1))
+        x = self.up1(torch.cat([_twice(x), x1], dim=1))
+        return self.head(x).float()
+
+
+def _twice(x: torch.Tensor) -> torch.Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def build_network(estimator: str, size_px: int, width: float) -> nn.Module:
+    return PaperRegressor(size_px) if estimator == "regression" else DenseSurfaceNet(width)

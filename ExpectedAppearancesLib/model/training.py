@@ -1,0 +1,263 @@
+"""The `train` stage: P_Omega on the case's expected appearances, resumable, its epoch chosen on an inner split."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from .. import files
+from ..appearances.store import read_appearances
+from ..case.case import Case
+from ..evaluation.metrics import add_mm
+from ..masks.stage import craniotomy_of, sampler_of
+from ..registration.confidence import calibrate, calibration_error
+from ..registration.decoding import PlausibleView, Reading, read_dense, read_regression
+from . import checkpoint
+from .encoding import PoseEncoding, fit_encoding, network_camera
+from .export import export_model
+from .feeder import Batch, Feeder, ViewMemory, draw_views
+from .losses import dense_loss, regression_loss
+from .networks import build_network
+from .presets import PAPER_EPOCHS, Preset
+from .views import ViewSettings
+
+CHECKPOINT_EVERY_S = 45.0
+LARGEST_COUNTED_ADD_MM = 20.0  # a lost view counts as this much, however far its pose is
+AVERAGE_DECAY = 0.995
+
+
+def train_case(
+    case: Case,
+    preset: Preset,
+    progress: Callable[[float, str], None],
+    device: torch.device,
+    seed: int = 0,
+    method: str | None = None,
+) -> dict:
+    """Train, calibrate, export to case.model_folder; returns the validation figures that are put on record.
+
+    Validation (inner split): poses of another seed and, with 4 textures or more, a texture that is not trained on.
+    """
+    method, appearances = read_appearances(case, method)
+    styles = sorted({a.style for a in appearances})
+    held_out = styles[len(styles) // 2 :: 8] if len(styles) >= 4 else []
+    trained_on = [s for s in styles if s not in held_out]
+    if preset.estimator == "regression":
+        steps = math.ceil(PAPER_EPOCHS * sum(a.style in trained_on for a in appearances) / preset.batch)
+        preset = replace(preset, steps=min(preset.steps, steps))
+    views = ViewSettings(
+        method, preset.size_px, tuple(trained_on), preset.fresh_poses, preset.negatives, preset.elastic_px, seed + 1
+    )
+    validation_views = replace(views, styles=tuple(held_out or styles), negatives=0.0, seed=seed + 1001)
+    poses = np.stack([sampler_of(case, seed + 1).sample(i) for i in range(400)])
+    encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
+    trainer = _Trainer(case, preset, encoding, device, seed, views)
+    progress(0.0, "rendering validation views")
+    validation = draw_views(case.folder, validation_views, preset.validation_views)
+    case.record("train", preset=preset.to_dict(), seed=seed, styles=trained_on, held_out_styles=held_out, done=False)
+    trainer.run(validation, progress)
+    progress(1.0, "calibrating confidence")
+    calibration = draw_views(
+        case.folder, replace(validation_views, negatives=0.3, seed=seed + 2001), 2 * preset.validation_views
+    )
+    figures = trainer.export(calibration, validation)
+    case.record(
+        "train",
+        done=True,
+        validation=figures,
+        method=method,
+        model_sha256=files.sha256(case.model_folder / "model.onnx"),
+    )
+    return figures
+
+
+class _Trainer:
+    """Network, optimiser, running average and schedule of one run."""
+
+    def __init__(
+        self, case: Case, preset: Preset, encoding: PoseEncoding, device: torch.device, seed: int, views: ViewSettings
+    ):
+        self.case, self.preset, self.encoding, self.device, self.views = case, preset, encoding, device, views
+        self.camera = network_camera(case.camera, preset.size_px)
+        torch.manual_seed(seed)
+        network = build_network(preset.estimator, preset.size_px, preset.width).to(device)
+        self.network = network.to(memory_format=torch.channels_last)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=preset.learning_rate, weight_decay=1e-4)
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.best = self.average
+        craniotomy = craniotomy_of(case)
+        ranges = sampler_of(case, 0).ranges
+        distance = ranges.working_distance_mm
+        self.plausible = PlausibleView(
+            craniotomy.centre_world_mm, craniotomy.outward_axis, ranges.tilt_max_deg, tuple(distance)
+        )
+        index = case.manifest["stages"].get("synthesize", {})
+        identity = f"{preset.to_dict()} {seed} {views} {index.get('updated')} {ranges}"
+        self.state = {
+            "settings": {"sha256": hashlib.sha256(identity.encode()).hexdigest()},
+            "step": 0,
+            "drawn": 0,
+            "seconds": 0.0,
+            "best_add_mm": None,
+            "curve": [],
+        }
+
+    def run(self, validation: Batch, progress: Callable[[float, str], None]) -> None:
+        restored = checkpoint.load(self.case.model_folder, self.network, self.optimizer, self.state["settings"])
+        if restored:
+            self.average, self.best, self.state = restored
+            logging.info("resuming at step %d", self.state["step"])
+        state, preset = self.state, self.preset
+        begin = time.monotonic() - state["seconds"]
+        saved = time.monotonic()
+        use_bfloat16 = self.device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+        recent: list[float] = []
+        first = state["drawn"]
+        with Feeder(self.case.folder, self.views, preset.fresh, first) as feeder:
+            memory = ViewMemory(feeder, preset.batch, preset.remembered, self.views.seed)
+            while True:
+                done = max(state["step"] / preset.steps, state["seconds"] / 60 / preset.minutes)
+                if done >= 1:
+                    break
+                batch = memory.next(state["step"])
+                state["drawn"] = first + memory.drawn
+                for group in self.optimizer.param_groups:
+                    group["lr"] = self._learning_rate(done)
+                self.network.train()
+                with torch.autocast(
+                    self.device.type, torch.bfloat16, enabled=use_bfloat16 and preset.estimator == "dense"
+                ):
+                    output = self.network(self._images(batch))
+                loss = self._loss(output, batch)
+                self.optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+                self.optimizer.step()
+                self._update_average(state["step"])
+                state["step"] += 1
+                state["seconds"] = time.monotonic() - begin
+                if state["step"] % 10 == 0:
+                    recent.append(float(loss.detach()))
+                    shown = state["best_add_mm"]
+                    text = "" if shown is None else f", validation ADD {shown:.2f} mm"
+                    progress(done, f"step {state['step']}, loss {np.mean(recent[-10:]):.3f}{text}")
+                if state["step"] % preset.validate_every == 0:
+                    self._validate(validation, recent)
+                    recent = []
+                if time.monotonic() - saved > CHECKPOINT_EVERY_S:
+                    self._save()
+                    saved = time.monotonic()
+        self._validate(validation, recent)
+        self._save()
+
+    def export(self, calibration: Batch, validation: Batch) -> dict:
+        """Calibrate the best network's confidence and write the model; returns its validation figures."""
+        self.network.load_state_dict(self.best)
+        self.network.eval()
+        readings = self._read(calibration)
+        positive = calibration.surface.any(axis=(1, 2))
+        errors = self._add(readings, calibration)
+        good = positive & (errors < 3.0)
+        usable = np.array([r.evidence is not None for r in readings])
+        evidence = np.array([r.evidence for r in readings if r.evidence is not None])
+        confidence = calibrate(evidence.reshape(usable.sum(), -1), good[usable])
+        probability = np.array([confidence.probability(r.evidence) for r in readings])
+        accepted = probability >= confidence.threshold
+        held_out_add = self._add(self._read(validation), validation)
+        figures = {
+            "add_mm_mean": round(float(held_out_add.mean()), 4),
+            "add_mm_median": round(float(np.median(held_out_add)), 4),
+            "add_below_3mm": round(float((held_out_add < 3).mean()), 4),
+            "accepted_of_true": round(float(accepted[positive].mean()), 4),
+            "accepted_of_false": round(float(accepted[~positive].mean()), 4) if (~positive).any() else None,
+            "accepted_add_below_3mm": round(float(good[accepted].mean()), 4) if accepted.any() else None,
+            "calibration_error": round(calibration_error(probability, good), 4),
+            "steps": self.state["step"],
+            "seconds": round(self.state["seconds"], 1),
+        }
+        meta = {
+            "estimator": self.preset.estimator,
+            "preset": self.preset.name,
+            "size_px": self.preset.size_px,
+            "camera": self.case.camera.to_dict(),
+            "encoding": self.encoding.to_dict(),
+            "plausible_view": self.plausible.to_dict(),
+            "confidence": confidence.to_dict(),
+            "validation": figures,
+            "vessels_sha256": self.case.manifest["inputs"]["vessels"]["sha256"],
+        }
+        files.write_json(
+            self.case.model_folder / "training.json", {"curve": self.state["curve"], "validation": figures}
+        )
+        export_model(self.network.cpu(), self.preset, meta, self.case.model_folder)
+        return figures
+
+    def _images(self, batch: Batch) -> torch.Tensor:
+        images = torch.from_numpy(batch.images).to(self.device).permute(0, 3, 1, 2).float() / 255
+        return images.contiguous(memory_format=torch.channels_last)
+
+    def _loss(self, output: torch.Tensor, batch: Batch) -> torch.Tensor:
+        if self.preset.estimator == "regression":
+            target = np.stack([self.encoding.encode(pose) for pose in batch.camera_from_world])
+            return regression_loss(output, torch.from_numpy(target).float().to(self.device), self.encoding)
+        tensors = (torch.from_numpy(a).to(self.device) for a in (batch.points_mm, batch.surface, batch.vessels))
+        return dense_loss(output, *tensors, self.encoding)
+
+    def _learning_rate(self, done: float) -> float:
+        """The paper's exponential decay for its network; for the dense one a short warm-up, then cosine decay."""
+        first, last = self.preset.learning_rate, self.preset.final_learning_rate
+        if self.preset.estimator == "regression":
+            return first * (last / first) ** done
+        warm_up = min(1.0, 0.02 + self.state["step"] / 60)
+        return warm_up * (last + (first - last) * 0.5 * (1 + math.cos(math.pi * done)))
+
+    @torch.no_grad()
+    def _update_average(self, step: int) -> None:
+        decay = min(AVERAGE_DECAY, (1 + step) / (10 + step))
+        for key, value in self.network.state_dict().items():
+            if value.is_floating_point():
+                self.average[key].lerp_(value, 1 - decay)
+            else:
+                self.average[key].copy_(value)
+
+    @torch.no_grad()
+    def _validate(self, validation: Batch, recent: list[float]) -> None:
+        kept = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.network.load_state_dict(self.average)
+        add = float(self._add(self._read(validation), validation).mean())
+        self.network.load_state_dict(kept)
+        loss = float(np.mean(recent)) if recent else None
+        self.state["curve"].append({"step": self.state["step"], "loss": loss, "validation_add_mm": round(add, 4)})
+        logging.info("step %d: loss %s, validation ADD %.3f mm", self.state["step"], loss, add)
+        if self.state["best_add_mm"] is None or add < self.state["best_add_mm"]:
+            self.state["best_add_mm"] = add
+            self.best = {k: v.clone() for k, v in self.average.items()}
+
+    @torch.no_grad()
+    def _read(self, batch: Batch) -> list[Reading]:
+        self.network.eval()
+        images = self._images(batch)
+        outputs = np.concatenate([self.network(images[i : i + 32]).cpu().numpy() for i in range(0, len(images), 32)])
+        if self.preset.estimator == "regression":
+            return [read_regression(output, self.encoding) for output in outputs]
+        return [read_dense(output, self.camera, self.encoding) for output in outputs]
+
+    def _add(self, readings: list[Reading], batch: Batch) -> np.ndarray:
+        vertices = self.case.vessels.vertices_mm[::20]
+        errors = [
+            LARGEST_COUNTED_ADD_MM
+            if r.camera_from_world is None
+            else min(float(add_mm(vertices, true[None], r.camera_from_world[None])[0]), LARGEST_COUNTED_ADD_MM)
+            for r, true in zip(readings, batch.camera_from_world, strict=True)
+        ]
+        return np.array(errors)
+
+    def _save(self) -> None:
+        checkpoint.save(self.case.model_folder, self.network, self.average, self.best, self.optimizer, self.state)

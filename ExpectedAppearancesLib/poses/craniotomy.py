@@ -1,0 +1,97 @@
+"""Where the surgeon looks from: the centre of the craniotomy and the axis that points out of the head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..case.meshes import Mesh
+from ..errors import InputError
+
+
+@dataclass(frozen=True)
+class Craniotomy:
+    """centre_world_mm (3,), outward unit axis (3,), and `up` (3,): the image-up direction of an upright microscope."""
+
+    centre_world_mm: np.ndarray
+    outward_axis: np.ndarray
+    up: np.ndarray
+
+
+def find_craniotomy(
+    vessels: Mesh,
+    cortex: Mesh | None = None,
+    space: str = "LPS",
+    point_world_mm: np.ndarray | None = None,
+    normal: np.ndarray | None = None,
+) -> Craniotomy:
+    """From a point and normal, else from the cortex model, else fitted to the vessels.
+
+    The centre is the vessels' centroid unless a point is given. Raises InputError for a normal of length 0.
+    """
+    centre = vessels.centroid_mm if point_world_mm is None else np.asarray(point_world_mm, float)
+    if normal is not None:
+        axis = np.asarray(normal, float)
+    elif cortex is not None:
+        axis = _axis_of_cortex(cortex)
+    else:
+        axis = _axis_of_vessels(vessels)
+    length = np.linalg.norm(axis)
+    if not np.isfinite(length) or length < 1e-9:
+        raise InputError("craniotomy: the outward axis cannot be found; give a point and an outward normal.")
+    axis = axis / length
+    return Craniotomy(centre, axis, upright(axis, space))
+
+
+def upright(axis: np.ndarray, space: str) -> np.ndarray:
+    """Unit vector across `axis` that is closest to the patient's superior direction, or anterior at the crown."""
+    superior = np.array([0.0, 0.0, 1.0])
+    anterior = np.array([0.0, -1.0 if space == "LPS" else 1.0, 0.0])
+    reference = superior if abs(axis @ superior) < np.cos(np.radians(25)) else anterior
+    across = reference - axis * (reference @ axis)
+    return across / np.linalg.norm(across)
+
+
+def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray, segments: int = 96) -> Mesh:
+    """Parenchyma for a case without a cortex model: a disc just below all vessels, 15 % wider than they are."""
+    heights = (vessels.vertices_mm - vessels.centroid_mm) @ outward_axis
+    centre = vessels.centroid_mm + outward_axis * (heights.min() - 0.1)
+    helper = np.eye(3)[np.argmin(np.abs(outward_axis))]
+    right = np.cross(outward_axis, helper)
+    right /= np.linalg.norm(right)
+    up = np.cross(outward_axis, right)
+    angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
+    rim = centre + 1.15 * vessels.radius_mm * (np.cos(angle) * right + np.sin(angle) * up)
+    index = np.arange(segments)
+    triangles = np.stack([np.zeros(segments, int), index + 1, (index + 1) % segments + 1], axis=1)
+    return Mesh(np.vstack([centre, rim]), triangles)
+
+
+def _axis_of_cortex(cortex: Mesh) -> np.ndarray:
+    """Area-weighted mean normal. Triangle order may be inside out, so the sign comes from the surface's bulge."""
+    corners = cortex.vertices_mm[cortex.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    mean = normals.sum(axis=0)
+    if np.linalg.norm(mean) < 0.3 * np.linalg.norm(normals, axis=1).sum():
+        # Mixed or closed: the flattest direction is what is left.
+        mean = _flattest_direction(cortex.vertices_mm)
+    return _towards_bulge(mean, cortex.vertices_mm)
+
+
+def _axis_of_vessels(vessels: Mesh) -> np.ndarray:
+    return _towards_bulge(_flattest_direction(vessels.vertices_mm), vessels.vertices_mm)
+
+
+def _flattest_direction(points_mm: np.ndarray) -> np.ndarray:
+    return np.linalg.svd(points_mm - points_mm.mean(axis=0), full_matrices=False)[2][2]
+
+
+def _towards_bulge(axis: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
+    """A brain is convex: along the outward axis its middle lies higher than its rim."""
+    axis = axis / np.linalg.norm(axis)
+    offset = points_mm - points_mm.mean(axis=0)
+    height = offset @ axis
+    distance_2 = (offset**2).sum(axis=1) - height**2
+    slope = np.polyfit(distance_2, height, 1)[0]
+    return -axis if slope > 0 else axis

@@ -1,0 +1,112 @@
+"""Pose from predicted surface coordinates: SQPnP inside RANSAC, then weighted Gauss-Newton. Numpy and OpenCV only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..geometry.camera import Camera
+from ..geometry.pose import pose_from_rotation, rotation_matrix
+
+RANSAC_POINTS = 400
+RANSAC_THRESHOLD_PX = 2.5  # of a network input of 128 px; scaled with its size
+HUBER = 1.5  # residuals beyond this many standard deviations lose weight
+ITERATIONS = 12
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """camera_from_world (4, 4); covariance (6, 6) of (rotation vector in the camera frame about the points' centre, rad;
+    translation, mm), as if all residuals were independent; inlier_share; residual: robust mean of |residual| / sigma."""
+
+    camera_from_world: np.ndarray
+    covariance: np.ndarray
+    inlier_share: float
+    residual: float
+
+    def expected_add_mm(self, radius_mm: float) -> float:
+        """Root mean square displacement of points at `radius_mm` around the centre that the covariance stands for."""
+        rotation, translation = np.trace(self.covariance[:3, :3]), np.trace(self.covariance[3:, 3:])
+        return float(np.sqrt(max(0.0, translation + rotation * radius_mm**2 * 2 / 3)))
+
+
+def fit_pose(
+    points_world_mm: np.ndarray, pixels: np.ndarray, sigma_mm: np.ndarray, camera: Camera, seed: int = 0
+) -> PoseFit | None:
+    """Pose that projects points (N, 3) onto pixels (N, 2), each with an error of sigma_mm (N,); None if none fits.
+
+    camera: undistorted. The seed makes RANSAC repeatable.
+    """
+    if len(points_world_mm) < 12:
+        return None
+    threshold_px = RANSAC_THRESHOLD_PX * camera.width / 128
+    order = np.argsort(sigma_mm, kind="stable")[: max(len(sigma_mm) // 2, 12)]
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, min(RANSAC_POINTS, len(order))).astype(int))]
+    cv2.setRNGSeed(seed)
+    try:
+        found, rotation_vector, translation, _ = cv2.solvePnPRansac(
+            points_world_mm[chosen].astype(np.float64),
+            pixels[chosen].astype(np.float64),
+            camera.matrix,
+            None,
+            iterationsCount=100,
+            reprojectionError=threshold_px,
+            confidence=0.999,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:
+        return None
+    if not found or not np.isfinite(translation).all():
+        return None
+    return _refine(
+        rotation_matrix(rotation_vector), translation.ravel(), points_world_mm, pixels, sigma_mm, camera, threshold_px
+    )
+
+
+def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_px) -> PoseFit | None:
+    centre = points.mean(axis=0)
+    relative = points - centre
+    position = rotation @ centre + translation  # the points' centre in the camera frame
+    focal = np.array([camera.fx, camera.fy])
+    principal = np.array([camera.cx, camera.cy])
+    information = np.eye(6)
+    for _ in range(ITERATIONS):
+        turned = relative @ rotation.T
+        seen = turned + position
+        if (seen[:, 2] < 1.0).mean() > 0.05:
+            return None
+        depth = np.maximum(seen[:, 2:], 1.0)
+        residual = pixels - (seen[:, :2] / depth * focal + principal)
+        sigma_px = np.maximum(focal.mean() * sigma_mm / depth[:, 0], 0.2)
+        distance = np.linalg.norm(residual, axis=1)
+        scaled = distance / sigma_px
+        # Huber weights, and none for what lies far off: an instrument, another patient's vessel.
+        weight = np.where(scaled < HUBER, 1.0, HUBER / np.maximum(scaled, 1e-9)) / sigma_px**2
+        weight = weight * (distance < 4 * threshold_px)
+        zero = np.zeros(len(depth))
+        x, y, z = turned.T
+        by_position = np.stack(
+            [
+                np.stack([focal[0] / depth[:, 0], zero, -focal[0] * seen[:, 0] / depth[:, 0] ** 2], axis=1),
+                np.stack([zero, focal[1] / depth[:, 0], -focal[1] * seen[:, 1] / depth[:, 0] ** 2], axis=1),
+            ],
+            axis=1,
+        )
+        by_rotation = by_position @ np.stack(
+            [np.stack([zero, z, -y], 1), np.stack([-z, zero, x], 1), np.stack([y, -x, zero], 1)], axis=1
+        )
+        jacobian = np.concatenate([by_rotation, by_position], axis=2)
+        weighted = jacobian * weight[:, None, None]
+        information = np.einsum("nki,nkj->ij", weighted, jacobian) + 1e-9 * np.eye(6)
+        step = np.linalg.solve(information, np.einsum("nki,nk->i", weighted, residual))
+        rotation = rotation_matrix(step[:3]) @ rotation
+        position = position + step[3:]
+        if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:]).max() < 1e-6:
+            break
+    if not np.isfinite(position).all():
+        return None
+    inlier_share = float((distance < threshold_px).mean())
+    pose = pose_from_rotation(rotation, position - rotation @ centre)
+    return PoseFit(pose, np.linalg.inv(information), inlier_share, float(np.minimum(scaled, 10).mean()))

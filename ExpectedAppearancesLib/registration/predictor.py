@@ -1,0 +1,114 @@
+"""A frame's pose from the exported model, with onnxruntime alone."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .. import files
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..model.encoding import PoseEncoding, network_camera
+from .confidence import Confidence
+from .decoding import PlausibleView, read_dense, read_regression
+
+FORMAT_VERSION = 1
+ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """camera_from_world (4, 4), or None where no pose was found; accepted: whether it may be shown; confidence: the
+    calibrated probability (0..1) that ADD < 3 mm; latency_ms: frame to pose."""
+
+    camera_from_world: np.ndarray | None
+    accepted: bool
+    confidence: float
+    latency_ms: float
+
+
+class Predictor:
+    """Reads model_folder once; then one forward pass per frame. Raises InputError for a missing or damaged model."""
+
+    def __init__(self, model_folder: Path, threads: int = 2):
+        import onnxruntime
+
+        folder = Path(model_folder)
+        meta = files.read_json(folder / "model.json", "trained model")
+        if not isinstance(meta, dict) or meta.get("format_version", FORMAT_VERSION + 1) > FORMAT_VERSION:
+            raise InputError(
+                f"{folder / 'model.json'}: made by a newer version; update ExpectedAppearances or train again."
+            )
+        path = folder / "model.onnx"
+        if not path.is_file():
+            raise InputError(f"{path}: trained model missing; run `train` first.")
+        if files.sha256(path) != meta.get("model_sha256"):
+            raise InputError(
+                f"{path}: damaged (SHA-256 differs from model.json); run `train` again, or restore the file."
+            )
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3
+        providers = [
+            p for p in ("CUDAExecutionProvider", "CPUExecutionProvider") if p in onnxruntime.get_available_providers()
+        ]
+        self._session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+        self.meta = meta
+        self.estimator = meta["estimator"]
+        self.case_camera = Camera.from_dict(meta["camera"], str(folder / "model.json"))
+        self.camera = network_camera(self.case_camera, meta["size_px"])
+        self.encoding = PoseEncoding.from_dict(meta["encoding"])
+        self.plausible = PlausibleView.from_dict(meta["plausible_view"])
+        self.confidence = Confidence.from_dict(meta["confidence"])
+        self._maps: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+
+    def predict(self, image_rgb: np.ndarray, camera: Camera | None = None) -> Prediction:
+        """Pose of a frame uint8 (H, W, 3) taken by `camera` (the case's if None; A is scaled to the frame's size).
+
+        Raises InputError when the camera's aspect ratio does not fit the frame.
+        """
+        begin = time.perf_counter()
+        camera = fitted_camera(camera or self.case_camera, image_rgb.shape[1], image_rgb.shape[0])
+        network_input = self._resample(image_rgb, camera).astype(np.float32).transpose(2, 0, 1)[None] / 255
+        output = self._session.run(None, {"image": network_input})[0][0]
+        if self.estimator == "regression":
+            reading = read_regression(output, self.encoding)
+        else:
+            reading = read_dense(output, self.camera, self.encoding)
+        confidence = self.confidence.probability(reading.evidence)
+        pose = reading.camera_from_world
+        accepted = pose is not None and confidence >= self.confidence.threshold and self.plausible.holds(pose)
+        return Prediction(pose, bool(accepted), confidence, (time.perf_counter() - begin) * 1000)
+
+    def _resample(self, image_rgb: np.ndarray, camera: Camera) -> np.ndarray:
+        """The frame as the network's camera would have taken it: undistorted, same centre of projection."""
+        shrink = self.camera.fx / camera.fx
+        if shrink < 0.75:
+            # Averaged down first, since remap samples single pixels and would alias.
+            size = (max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
+            image_rgb = cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA)
+            camera = camera.resized(*size)
+        key = (camera, self.camera)
+        if key not in self._maps:
+            distortion = np.array(camera.distortion) if camera.is_distorted else None
+            size = (self.camera.width, self.camera.height)
+            self._maps = {
+                key: cv2.initUndistortRectifyMap(
+                    camera.matrix, distortion, None, self.camera.matrix, size, cv2.CV_32FC1
+                )
+            }
+        return cv2.remap(image_rgb, *self._maps[key], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
+    """A scaled to a frame of width x height px. Raises InputError when the frame has another aspect ratio."""
+    if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
+        raise InputError(
+            f"the frame is {width} x {height} px, the camera {camera.width} x {camera.height} px: another aspect ratio; "
+            "give the intrinsics of these frames with --camera, or crop the frames as when the camera was calibrated."
+        )
+    return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)

@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+from cases import camera, dome, vessels
+from scipy.spatial.transform import Rotation
+
+from ExpectedAppearancesLib.case.meshes import Mesh
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.geometry.pose import inverse, is_rigid
+from ExpectedAppearancesLib.poses.craniotomy import Craniotomy, disc_under_vessels, find_craniotomy
+from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
+
+TURN = Rotation.from_euler("xyz", [40, -65, 20], degrees=True).as_matrix()
+
+
+def turned(mesh: Mesh, inside_out: bool = False) -> Mesh:
+    return Mesh(mesh.vertices_mm @ TURN.T + [5, -80, 30], mesh.triangles[:, ::-1] if inside_out else mesh.triangles)
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_outward_axis_is_found_from_the_cortex_whatever_its_triangle_order(inside_out):
+    found = find_craniotomy(turned(vessels()), turned(dome(), inside_out))
+    assert np.degrees(np.arccos(found.outward_axis @ TURN[:, 2])) < 2
+
+
+def test_outward_axis_is_fitted_to_the_vessels_where_there_is_no_cortex():
+    found = find_craniotomy(turned(vessels()))
+    assert np.degrees(np.arccos(found.outward_axis @ TURN[:, 2])) < 12
+
+
+def test_point_and_normal_are_taken_as_given():
+    found = find_craniotomy(vessels(), dome(), point_world_mm=[1, 2, 3], normal=[0, 3, 4])
+    np.testing.assert_allclose(found.centre_world_mm, [1, 2, 3])
+    np.testing.assert_allclose(found.outward_axis, [0, 0.6, 0.8])
+    with pytest.raises(InputError, match="normal"):
+        find_craniotomy(vessels(), normal=[0, 0, 0])
+
+
+def test_image_up_is_superior_and_at_the_crown_anterior():
+    side = find_craniotomy(vessels(), normal=[1, 0, 0.3])
+    assert side.up[2] > 0.9 and abs(side.up @ side.outward_axis) < 1e-12
+    assert find_craniotomy(vessels(), normal=[0, 0, 1], space="LPS").up[1] == pytest.approx(-1)
+    assert find_craniotomy(vessels(), normal=[0, 0, 1], space="RAS").up[1] == pytest.approx(1)
+
+
+def test_disc_lies_below_all_vessels_and_reaches_beyond_them():
+    mesh, axis = turned(vessels()), TURN[:, 2]
+    disc = disc_under_vessels(mesh, axis)
+    assert (disc.vertices_mm @ axis).max() < (mesh.vertices_mm @ axis).min()
+    assert disc.radius_mm > 1.1 * mesh.radius_mm
+
+
+def sampler(**ranges) -> PoseSampler:
+    craniotomy = Craniotomy(vessels().centroid_mm, np.array([0, 0, 1.0]), np.array([0, -1.0, 0]))
+    return PoseSampler(craniotomy, PoseRanges(**ranges), camera(), vessels().vertices_mm, seed=3)
+
+
+def test_poses_keep_to_their_ranges():
+    given = sampler(
+        tilt_max_deg=50, roll_max_deg=20, working_distance_mm=(90, 120), lateral_offset_mm=4, in_view_min=0.0
+    )
+    middle_ray = np.linalg.solve(camera().matrix, [(camera().width - 1) / 2, (camera().height - 1) / 2, 1])
+    tilts = []
+    for i in range(300):
+        pose = given.sample(i)
+        assert is_rigid(pose, 1e-9)
+        tilt = np.degrees(np.arccos(-pose[2, 2]))
+        assert tilt <= 50.0001
+        tilts.append(tilt)
+        # What the middle of the image shows lies on the plane through the centre, within the lateral offset.
+        eye, ray = inverse(pose)[:3, 3], pose[:3, :3].T @ middle_ray
+        hit = eye - ray * ((eye - vessels().centroid_mm)[2] / ray[2])
+        assert np.linalg.norm(hit - vessels().centroid_mm) <= 4.0001
+        assert 90 - 1e-6 <= (pose[:3, :3] @ hit + pose[:3, 3])[2] <= 120 + 1e-6
+        # Roll: turn the view back to the axis by the shortest rotation, then compare with the upright image.
+        towards = -pose[2, :3]
+        back, _ = Rotation.align_vectors([[0, 0, 1.0]], [towards])
+        if tilt > 1e-3:
+            axis = np.cross(towards, [0, 0, 1.0])
+            back = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.radians(tilt))
+        up = back.apply(-pose[1, :3])
+        assert np.degrees(np.arccos(np.clip(up @ [0, -1.0, 0], -1, 1))) <= 20.0001
+    # Uniform on the cap: the cosine of the tilt is uniform between cos 50 and 1.
+    cosine = np.cos(np.radians(tilts))
+    assert np.mean(cosine) == pytest.approx((1 + np.cos(np.radians(50))) / 2, abs=0.02)
+
+
+def test_same_seed_same_poses_and_each_index_its_own():
+    first, again = sampler(), sampler()
+    np.testing.assert_array_equal(first.sample(7), again.sample(7))
+    assert np.abs(first.sample(7) - first.sample(8)).max() > 1e-3
+
+
+def test_vessels_are_in_view():
+    given = sampler(in_view_min=0.9)
+    for i in range(50):
+        projected = camera().project(vessels().vertices_mm @ given.sample(i)[:3, :3].T + given.sample(i)[:3, 3])
+        inside = ((projected > -0.5) & (projected < 95.5)).all(axis=1)
+        assert inside.mean() > 0.87
+    with pytest.raises(InputError, match="no view held 95%"):
+        sampler(working_distance_mm=(5, 6), in_view_min=0.95).sample(0)
+
+
+def test_all_impossible_ranges_are_reported_at_once():
+    with pytest.raises(InputError) as error:
+        sampler(tilt_max_deg=120, roll_max_deg=-1, working_distance_mm=(50, 40), lateral_offset_mm=-1)
+    assert len(error.value.problems) == 4
