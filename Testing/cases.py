@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
@@ -25,7 +27,7 @@ def vessels(bulge_mm: float = 4.0, side_mm: float = 40.0, radius_mm: float = 1.0
     paths = [[(-14, -12), (-3, 0), (4, 3), (13, 12)], [(4, 3), (9, -4), (14, -13)], [(-3, 0), (-8, 9)]]
     vertices, triangles = [], []
     for path in paths:
-        points = np.concatenate([np.linspace(a, b, 9)[:-1] for a, b in zip(path, path[1:])] + [[path[-1]]])
+        points = np.concatenate([np.linspace(a, b, 9)[:-1] for a, b in itertools.pairwise(path)] + [[path[-1]]])
         heights = -bulge_mm * (points**2).sum(axis=1) / (side_mm / 2) ** 2 + 0.3 * radius_mm
         spine = np.column_stack([points, heights])
         ahead = np.gradient(spine, axis=0)
