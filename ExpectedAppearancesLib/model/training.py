@@ -18,7 +18,7 @@ from ..case.case import Case
 from ..evaluation.metrics import add_mm
 from ..masks.stage import craniotomy_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
-from ..registration.decoding import PlausibleView, Reading, read_dense, read_regression
+from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
 from . import checkpoint
 from .encoding import PoseEncoding, fit_encoding, network_camera
 from .export import export_model
@@ -167,7 +167,7 @@ class _Trainer:
         good = positive & (errors < 3.0)
         usable = np.array([r.evidence is not None for r in readings])
         evidence = np.array([r.evidence for r in readings if r.evidence is not None])
-        confidence = calibrate(evidence.reshape(usable.sum(), -1), good[usable])
+        confidence = calibrate(evidence.reshape(usable.sum(), EVIDENCE[self.preset.estimator]), good[usable])
         probability = np.array([confidence.probability(r.evidence) for r in readings])
         accepted = probability >= confidence.threshold
         held_out_add = self._add(self._read(validation), validation)

@@ -11,6 +11,7 @@ from ..geometry.pose import inverse, transform
 from ..model.encoding import PoseEncoding
 from .pnp import PoseFit, fit_pose
 
+EVIDENCE = {"dense": 8, "regression": 0}  # numbers of evidence that an estimator gives
 LEAST_CELLS = 40  # fewer cells of surface than this cannot carry a pose
 
 

@@ -1,0 +1,241 @@
+import json
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cases import camera, write_inputs
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.appearances import store
+from ExpectedAppearancesLib.appearances.overview import overview_view
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.cli import main
+from ExpectedAppearancesLib.errors import CancelledError, InputError
+from ExpectedAppearancesLib.geometry.pose import transform
+from ExpectedAppearancesLib.masks.renderer import MaskRenderer
+from ExpectedAppearancesLib.masks.stage import craniotomy_of, parenchyma_of, read_rendered, render_case
+from ExpectedAppearancesLib.model import views
+from ExpectedAppearancesLib.model.encoding import fit_encoding, network_camera
+from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
+from ExpectedAppearancesLib.model.networks import build_network
+from ExpectedAppearancesLib.model.presets import PRESETS
+from ExpectedAppearancesLib.model.training import train_case
+from ExpectedAppearancesLib.registration.decoding import cell_pixels
+from ExpectedAppearancesLib.registration.predictor import Predictor
+
+CPU = torch.device("cpu")
+COLOURS = np.array([[0, 0, 0], [225, 170, 160], [60, 30, 200]], np.uint8)
+TINY = replace(PRESETS["quick"], size_px=64, steps=4, batch=4, fresh=2, validation_views=6, validate_every=2, width=0.4)
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> Case:
+    """A case whose appearances are its label maps in plain colours: what a pixel shows is known exactly."""
+    folder = tmp_path_factory.mktemp("training")
+    paths = write_inputs(folder)
+    case = Case.create(folder / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
+    render_case(case, lambda *_: None, poses=4)
+    craniotomy = craniotomy_of(case)
+    overview, overview_pose = overview_view(craniotomy, parenchyma_of(case, craniotomy), 128)
+    with MaskRenderer(case.vessels, case.cortex, overview) as renderer:
+        labels = renderer.render(overview_pose)
+    write_appearances(case, "surface", overview, [(labels, overview_pose)])
+    rendered = [(files.read_label_map(f["labels"]), f["camera_from_world"]) for f in read_rendered(case)]
+    write_appearances(case, "image", case.camera, rendered)
+    return case
+
+
+def write_appearances(case, method, seen_by, frames) -> None:
+    folder, items = store.folder_of(case, method), []
+    for i, (labels, pose) in enumerate(frames):
+        files.write_png(folder / f"{i}.labels.png", labels)
+        files.write_png(folder / f"{i}.png", COLOURS[labels])
+        for style in "ab":
+            entry = {"image": f"{i}.png", "labels": f"{i}.labels.png", "style": style, "seed": 0, "gram_distance": 0.0}
+            items.append(entry | {"camera_from_world": pose.tolist()})
+    store.write_index(case, method, seen_by, {}, items, done=True)
+
+
+def settings(method: str, **changes) -> views.ViewSettings:
+    return replace(views.ViewSettings(method, 64, ("a", "b"), True, 0.0, 0.0, seed=5), **changes)
+
+
+def agreement(view: views.View) -> float:
+    """Intersection over union of the cells that look like vessels and those said to be."""
+    cells = view.image.reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
+    blue = (cells[..., 2] > cells[..., 0] + 20) & (view.surface > 0)
+    return (blue & (view.vessels > 0)).sum() / max(1, (blue | (view.vessels > 0)).sum())
+
+
+@pytest.mark.parametrize("method", ["surface", "image"])
+def test_views_show_at_each_cell_what_they_say(case, method, monkeypatch):
+    """Points project onto their cells; colours and vessel cells agree, so image and geometry come from one pose."""
+    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
+    monkeypatch.setattr(views, "_lit", lambda image, *_: image)
+    source = views.ViewSource(case.folder, settings(method))
+    agreeing = []
+    for index in range(6):
+        view = source.view(index)
+        flat = view.surface.ravel() > 0
+        assert 0.05 < flat.mean() < 0.95
+        seen = transform(view.camera_from_world, view.points_mm.reshape(-1, 3)[flat].astype(float))
+        pixels = network_camera(case.camera, 64).project(seen)
+        assert np.abs(pixels - cell_pixels(32)[flat]).max() < 0.35
+        agreeing.append(agreement(view))
+    source.close()
+    assert np.mean(agreeing) > 0.6  # vessels are about two cells wide: edges cost the rest
+
+
+def test_views_depend_only_on_seed_and_index_and_have_poses_of_their_own(case):
+    first = views.ViewSource(case.folder, settings("surface"))
+    again = views.ViewSource(case.folder, settings("surface"))
+    first.view(0)
+    one, two = first.view(3), again.view(3)
+    np.testing.assert_array_equal(one.image, two.image)
+    assert np.abs(one.camera_from_world - first.view(4).camera_from_world).max() > 1e-3
+    paper = views.ViewSource(case.folder, settings("image", fresh_poses=False))
+    stored = [frame["camera_from_world"] for frame in read_rendered(case)]
+    assert all(min(np.abs(paper.view(i).camera_from_world - p).max() for p in stored) < 1e-12 for i in range(5))
+
+
+def test_negative_views_have_no_surface(case):
+    source = views.ViewSource(case.folder, settings("surface", negatives=1.0))
+    drawn = [source.view(i) for i in range(8)]
+    assert not any(view.surface.any() or view.vessels.any() for view in drawn)
+    assert all(view.image.std() > 0 for view in drawn)
+
+
+def test_elastic_deformation_takes_the_points_along(case, monkeypatch):
+    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
+    monkeypatch.setattr(views, "_lit", lambda image, *_: image)
+    straight = views.ViewSource(case.folder, settings("surface"))
+    bent = views.ViewSource(case.folder, settings("surface", elastic_px=6.0))
+    pairs = [(straight.view(i), bent.view(i)) for i in range(6)]
+    assert any((a.points_mm != b.points_mm).any() for a, b in pairs)
+    assert all((a.camera_from_world == b.camera_from_world).all() for a, b in pairs)
+    assert np.mean([agreement(b) for _, b in pairs]) > 0.6
+
+
+def test_losses_against_plain_formulas():
+    rng = np.random.default_rng(0)
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, :3, 3] = rng.normal(size=(3, 3)) * 10 + [0, 0, 100]
+    encoding = fit_encoding(poses, np.array([1.0, 2.0, 3.0]), 20.0)
+    output, target = rng.normal(size=(2, 6)), rng.normal(size=(2, 6))
+    plain = np.mean(
+        [
+            np.linalg.norm((o[3:] - t[3:]) * encoding.translation_scale_mm) + np.linalg.norm(o[:3] - t[:3])
+            for o, t in zip(output, target, strict=True)
+        ]
+    )
+    assert regression_loss(torch.tensor(output), torch.tensor(target), encoding).item() == pytest.approx(plain)
+    points = torch.tensor(rng.normal(size=(1, 4, 4, 3)) * 5, dtype=torch.float32)
+    surface = torch.tensor(rng.integers(0, 2, (1, 4, 4)), dtype=torch.uint8)
+    perfect = torch.zeros(1, 6, 4, 4)
+    perfect[:, :3] = ((points - torch.tensor([1.0, 2.0, 3.0])) / 20).permute(0, 3, 1, 2)
+    perfect[:, 3], perfect[:, 5] = -5, -9
+    perfect[:, 4] = 18 * surface.float() - 9
+    no_vessels = torch.zeros_like(surface)
+    best = dense_loss(perfect, points, surface, no_vessels, encoding)
+    assert best.item() == pytest.approx(-15, abs=0.05)
+    # What the network says where there is no surface must not matter.
+    elsewhere = perfect.clone()
+    elsewhere[:, :4] += 3 * (1 - surface.float())[:, None]
+    torch.testing.assert_close(dense_loss(elsewhere, points, surface, no_vessels, encoding), best)
+    worse = perfect.clone()
+    worse[:, 0] += 0.5
+    assert dense_loss(worse, points, surface, no_vessels, encoding) > best + 1
+
+
+def test_paper_network_is_the_papers():
+    network = build_network("regression", 128, 1.0)
+    kinds = [type(layer).__name__ for layer in network.features]
+    block = ["Conv2d", "Conv2d", "ReLU"]
+    assert kinds == [*block, "AvgPool2d", *block, "AvgPool2d", *block]
+    assert [layer.out_features for layer in network.head if hasattr(layer, "out_features")] == [128, 64, 32, 6]
+    preset = PRESETS["paper"]
+    assert (preset.batch, preset.learning_rate, preset.final_learning_rate) == (8, 1e-3, 1e-4)
+
+
+@pytest.fixture(scope="module")
+def trained(case) -> Case:
+    calls = []
+
+    def kill_after_three(fraction, _message):
+        calls.append(fraction)
+
+    train_case(case, TINY, kill_after_three, CPU, method="surface")
+    assert calls == sorted(calls)
+    return case
+
+
+def test_trained_model_registers_frames_of_any_size_and_colour(trained, tmp_path):
+    meta = json.loads((trained.model_folder / "model.json").read_text())
+    assert meta["export_difference"] < 1e-4 and meta["validation"]["steps"] == 4
+    predictor = Predictor(trained.model_folder)
+    for shape in ((96, 96, 3), (500, 500, 3), (41, 41, 3)):
+        prediction = predictor.predict(np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8), camera())
+        assert 0 <= prediction.confidence <= 1 and prediction.latency_ms > 0 and not prediction.accepted
+    files.write_png(tmp_path / "ä b.png", np.zeros((96, 96), np.uint8))
+    out = tmp_path / "poses.json"
+    assert main(["register", str(trained.folder), str(tmp_path / "ä b.png"), "--out", str(out)]) == 0
+    frame = json.loads(out.read_text())["frames"][0]
+    assert frame["image"] == "ä b.png" and frame["accepted"] is False
+    assert {"confidence", "rotation_vector_rad", "translation_mm", "latency_ms", "camera_from_world"} <= frame.keys()
+
+
+def test_every_bad_frame_is_listed_and_nothing_is_written(trained, tmp_path, capsys):
+    files.write_png(tmp_path / "wide.png", np.zeros((50, 96), np.uint8))
+    (tmp_path / "cut.png").write_bytes(b"\x89PNG")
+    out = tmp_path / "poses.json"
+    code = main(
+        ["register", str(trained.folder), str(tmp_path / "wide.png"), str(tmp_path / "cut.png"), "--out", str(out)]
+    )
+    text = capsys.readouterr().err
+    assert code == 2 and "wide.png" in text and "cut.png" in text and "aspect" in text and not out.exists()
+
+
+def test_training_is_on_record_with_seeds_styles_and_curve(trained):
+    entry = json.loads((trained.folder / "case.json").read_text())["stages"]["train"]
+    assert entry["done"] and entry["seed"] == 0 and entry["styles"] == ["a", "b"]
+    assert entry["model_sha256"] == files.sha256(trained.model_folder / "model.onnx")
+    curve = json.loads((trained.model_folder / "training.json").read_text())["curve"]
+    assert [point["step"] for point in curve] == [2, 4, 4] and all(p["validation_add_mm"] >= 0 for p in curve)
+
+
+def test_a_stopped_training_goes_on_from_its_checkpoint(trained, monkeypatch):
+    from ExpectedAppearancesLib.model import training
+
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
+    preset = replace(TINY, steps=6)
+    saves = []
+    original = training._Trainer._save
+
+    def cancel_after_second(self):
+        original(self)
+        saves.append(self.state["step"])
+        if len(saves) == 2:
+            raise CancelledError("stop")
+
+    monkeypatch.setattr(training._Trainer, "_save", cancel_after_second)
+    before = threading.active_count()
+    with pytest.raises(CancelledError):
+        train_case(trained, preset, lambda *_: None, CPU, seed=9, method="surface")
+    figures = train_case(trained, preset, lambda *_: None, CPU, seed=9, method="surface")
+    assert saves[:3] == [1, 2, 3] and figures["steps"] == 6
+    assert threading.active_count() <= before + 1
+
+
+def test_a_damaged_checkpoint_is_not_gone_on_from(trained):
+    path = trained.model_folder / "checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert train_case(trained, replace(TINY, steps=2), lambda *_: None, CPU, method="surface")["steps"] == 2
+
+
+def test_training_without_appearances_says_what_to_run(tmp_path):
+    paths = write_inputs(tmp_path)
+    bare = Case.create(tmp_path / "case", paths["vessels.vtp"], None, paths["camera.json"])
+    with pytest.raises(InputError, match="run `synthesize` first"):
+        train_case(bare, TINY, lambda *_: None, CPU)
