@@ -1,0 +1,141 @@
+"""Textures T: photographs of some cortex with the label map T_class of each, read and checked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .. import files
+from ..errors import InputError, Problems
+
+LABELS_SUFFIX = ".labels.png"
+SHARED_LABELS = "labels.png"
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+BACKGROUND, PARENCHYMA, VESSELS = 0, 1, 2
+CLASS_NAMES = {PARENCHYMA: "parenchyma", VESSELS: "vessels"}
+MINIMUM_CLASS_PX = 200  # below this a Gram matrix says more about the single pixels than about the tissue
+
+
+@dataclass(frozen=True)
+class Texture:
+    """One T: `image` uint8 RGB (H, W, 3) and its `labels` uint8 (H, W): 0 background, 1 parenchyma, 2 vessels.
+
+    Background is usually absent; synthesis defines it as black, the dark outside of the microscope's field.
+    """
+
+    name: str
+    image: np.ndarray
+    labels: np.ndarray
+
+    def class_shares(self) -> dict[str, float]:
+        """Share of the pixels in each class, for listings."""
+        return {name: float((self.labels == label).mean()) for label, name in CLASS_NAMES.items()}
+
+
+def shipped_textures_folder() -> Path:
+    """Folder of the textures that come with the library (made by textures/generate.py)."""
+    return Path(__file__).parent / "generated"
+
+
+def read_library(folder: Path, exclude: Iterable[str] = ()) -> list[Texture]:
+    """Every texture of `folder`, sorted by name, without the names in `exclude`.
+
+    NAME.png (or .jpg, .tif) goes with NAME.labels.png, or with one labels.png for all. Raises InputError with all
+    problems at once: no folder, no textures, unknown excluded names, unreadable files, and what check_texture finds.
+    """
+    folder = Path(folder)
+    images = _image_paths(folder)
+    exclude = {str(name) for name in exclude}
+    problems = Problems()
+    unknown = sorted(exclude - set(images))
+    if unknown:
+        problems.add(
+            f"{folder}: no texture is called {', '.join(unknown)}, so it cannot be excluded; there are {', '.join(images)}."
+        )
+    shared_path = folder / SHARED_LABELS
+    shared_labels, shared_failed = None, False
+    textures = []
+    for name, path in images.items():
+        if name in exclude:
+            continue
+        labels_path = folder / f"{name}{LABELS_SUFFIX}"
+        labels = None
+        with problems.collect():
+            if labels_path.is_file():
+                labels = files.read_label_map(labels_path)
+            elif shared_path.is_file():
+                labels_path = shared_path
+                if shared_labels is None and not shared_failed:
+                    shared_failed = True  # taken back below; so a bad shared map is reported once, not per texture
+                    shared_labels = files.read_label_map(shared_path)
+                    shared_failed = False
+                labels = shared_labels
+            else:
+                problems.add(
+                    f"{path}: has no label map; add {name}{LABELS_SUFFIX} (1 parenchyma, 2 vessels), "
+                    f"or one {SHARED_LABELS} for all textures."
+                )
+        image = None
+        with problems.collect():
+            image = files.read_image_rgb(path)
+        if image is None or labels is None:
+            continue
+        found = check_texture(path, image, labels_path, labels)
+        for problem in found:
+            if problem not in problems.found:
+                problems.add(problem)
+        if not found:
+            textures.append(Texture(name, image, labels))
+    if not textures and not problems.found:
+        problems.add(f"{folder}: every texture is excluded; leave at least one.")
+    problems.raise_if_any()
+    return textures
+
+
+def check_texture(path: Path, image: np.ndarray, labels_path: Path, labels: np.ndarray) -> list[str]:
+    """Problems of one texture: sizes that differ, values other than 0, 1, 2, too few pixels of a class."""
+    found = []
+    if image.shape[:2] != labels.shape:
+        found.append(
+            f"{path}: is {image.shape[1]} x {image.shape[0]} px but its label map {labels_path.name} is "
+            f"{labels.shape[1]} x {labels.shape[0]} px; make both the same size."
+        )
+    foreign = sorted(set(np.unique(labels).tolist()) - {BACKGROUND, PARENCHYMA, VESSELS})
+    if foreign:
+        shown = ", ".join(str(value) for value in foreign[:5])
+        found.append(
+            f"{labels_path}: holds the value(s) {shown}; only 0 (background), 1 (parenchyma) and 2 (vessels) are allowed."
+        )
+    for label, class_name in CLASS_NAMES.items():
+        count = int((labels == label).sum())
+        if count < MINIMUM_CLASS_PX:
+            found.append(
+                f"{labels_path}: only {count} px of {class_name} (value {label}), at least {MINIMUM_CLASS_PX} are "
+                "needed; label more of it, or leave this texture out."
+            )
+    return found
+
+
+def _image_paths(folder: Path) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: textures folder not found; check the path.")
+    images: dict[str, Path] = {}
+    problems = Problems()
+    for path in sorted(folder.iterdir()):
+        is_labels = path.name.lower() == SHARED_LABELS or path.name.lower().endswith(LABELS_SUFFIX)
+        if path.suffix.lower() not in IMAGE_SUFFIXES or is_labels or path.name.startswith("."):
+            continue
+        if path.stem in images:
+            problems.add(f"{path}: another texture is called {path.stem} too ({images[path.stem].name}); rename one.")
+        images[path.stem] = path
+    problems.raise_if_any()
+    if not images:
+        raise InputError(f"{folder}: holds no textures; put NAME.png with NAME{LABELS_SUFFIX} there.")
+    # Natural order, so that texture 10 follows 9.
+    return dict(
+        sorted(images.items(), key=lambda item: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", item[0])])
+    )

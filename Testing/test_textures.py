@@ -1,0 +1,113 @@
+"""The texture library: what it reads, what it refuses, and the textures that ship."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.textures.library import read_library
+
+CORTEX_TEXTURES = Path(__file__).parents[2] / "shared/data/cortex/textures"
+
+
+def photo(value: int = 100, size: int = 64) -> np.ndarray:
+    image = np.full((size, size, 3), value, np.uint8)
+    image[..., 0] = 200  # red differs from blue, so swapped channels are seen
+    return image
+
+
+def label_map(size: int = 64) -> np.ndarray:
+    labels = np.ones((size, size), np.uint8)
+    labels[:, size // 2 :] = 2
+    return labels
+
+
+def add(folder: Path, name: str, image=None, labels=None) -> None:
+    files.write_png(folder / f"{name}.png", photo() if image is None else image)
+    files.write_png(folder / f"{name}.labels.png", label_map() if labels is None else labels)
+
+
+def test_reads_image_and_labels_of_each(tmp_path):
+    add(tmp_path, "b10")
+    add(tmp_path, "b9", labels=np.fliplr(label_map()))
+    textures = read_library(tmp_path)
+    assert [t.name for t in textures] == ["b9", "b10"]
+    assert textures[1].image[0, 0].tolist() == [200, 100, 100]
+    np.testing.assert_array_equal(textures[0].labels, np.fliplr(label_map()))
+    assert textures[1].class_shares() == {"parenchyma": 0.5, "vessels": 0.5}
+
+
+def test_one_label_map_serves_all_but_an_own_one_wins(tmp_path):
+    files.write_png(tmp_path / "labels.png", label_map())
+    files.write_png(tmp_path / "shared.png", photo())
+    add(tmp_path, "own", labels=label_map().T)
+    own, shared = read_library(tmp_path)
+    np.testing.assert_array_equal(shared.labels, label_map())
+    np.testing.assert_array_equal(own.labels, label_map().T)
+
+
+def test_excluded_textures_are_left_out_and_not_even_checked(tmp_path):
+    add(tmp_path, "good")
+    files.write_png(tmp_path / "bad.png", photo())
+    assert [t.name for t in read_library(tmp_path, exclude=["bad"])] == ["good"]
+
+
+def test_reports_all_problems_at_once_with_the_file_of_each(tmp_path):
+    few = np.ones((64, 64), np.uint8)
+    few[:10, :10] = 2  # 100 px of vessels
+    foreign = label_map()
+    foreign[0, 0] = 7
+    files.write_png(tmp_path / "nolabels.png", photo())
+    add(tmp_path, "size", labels=label_map(32))
+    add(tmp_path, "few", labels=few)
+    add(tmp_path, "foreign", labels=foreign)
+    add(tmp_path, "damaged")
+    (tmp_path / "damaged.png").write_bytes((tmp_path / "damaged.png").read_bytes()[:20])
+    with pytest.raises(InputError) as error:
+        read_library(tmp_path, exclude=["nosuch"])
+    expected = {
+        "nosuch": "cannot be excluded",
+        "nolabels.png": "no label map",
+        "size.png": "64 x 64 px but",
+        "few.labels.png": "only 100 px of vessels",
+        "foreign.labels.png": "value(s) 7",
+        "damaged.png": "not an image",
+    }
+    assert len(error.value.problems) == len(expected)
+    for name, text in expected.items():
+        assert any(name in problem and text in problem for problem in error.value.problems), (
+            name,
+            error.value.problems,
+        )
+
+
+def test_a_bad_shared_label_map_is_reported_once(tmp_path):
+    (tmp_path / "labels.png").write_bytes(b"not a png")
+    for name in "abc":
+        files.write_png(tmp_path / f"{name}.png", photo())
+    with pytest.raises(InputError) as error:
+        read_library(tmp_path)
+    assert len(error.value.problems) == 1
+
+
+@pytest.mark.parametrize("make", [lambda folder: folder / "missing", lambda folder: folder])
+def test_refuses_missing_and_empty_folders(tmp_path, make):
+    with pytest.raises(InputError, match=r"not found|holds no textures"):
+        read_library(make(tmp_path))
+
+
+def test_refuses_to_exclude_everything(tmp_path):
+    add(tmp_path, "only")
+    with pytest.raises(InputError, match="every texture is excluded"):
+        read_library(tmp_path, exclude=["only"])
+
+
+@pytest.mark.skipif(not CORTEX_TEXTURES.is_dir(), reason="the cortex data set is not on this machine")
+def test_reads_the_textures_of_the_cortex_case():
+    textures = read_library(CORTEX_TEXTURES)
+    assert len(textures) == 11
+    assert all(t.image.shape == (512, 512, 3) and t.labels.shape == (512, 512) for t in textures)
