@@ -22,7 +22,9 @@ CENTRE = np.array([30.0, -60.0, 45.0])
 
 def pose(seed: int, spread_deg: float = 40.0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    rotation = Rotation.from_rotvec(np.radians(spread_deg) * rng.uniform(-1, 1, 3)) * Rotation.from_euler("x", 180, degrees=True)
+    rotation = Rotation.from_rotvec(np.radians(spread_deg) * rng.uniform(-1, 1, 3)) * Rotation.from_euler(
+        "x", 180, degrees=True
+    )
     centre_camera = np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(80, 140)])
     return pose_from_rotation(rotation.as_matrix(), centre_camera - rotation.as_matrix() @ CENTRE)
 
@@ -146,7 +148,9 @@ def test_confidence_is_calibrated_and_its_threshold_keeps_bad_poses_out():
 
 def test_implausible_views_are_told():
     plausible = PlausibleView(CENTRE, np.array([0, 0, 1.0]), 60.0, (80.0, 140.0))
-    from_above = pose_from_rotation(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 100.0]) - np.diag([1.0, -1.0, -1.0]) @ CENTRE)
+    from_above = pose_from_rotation(
+        np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 100.0]) - np.diag([1.0, -1.0, -1.0]) @ CENTRE
+    )
     assert plausible.holds(from_above)
     from_below = pose_from_rotation(np.eye(3), np.array([0, 0, 100.0]) - CENTRE)
     assert not plausible.holds(from_below)

@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -163,7 +165,7 @@ def test_torchvision_weights_give_the_same_features(tmp_path, vgg):
     indices = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
     widths = [3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512]
     state = {}
-    for i, (a, b) in zip(indices, zip(widths, widths[1:], strict=False), strict=True):
+    for i, (a, b) in zip(indices, itertools.pairwise(widths), strict=True):
         state[f"features.{i}.weight"] = torch.randn(b, a, 3, 3) * 0.05
         state[f"features.{i}.bias"] = torch.randn(b) * 0.1
     torch.save(state, tmp_path / "vgg16.pth")

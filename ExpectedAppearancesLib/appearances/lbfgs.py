@@ -18,8 +18,8 @@ def minimise(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Minimise loss(x)[b] over x[b] for all b at once; loss maps (B, ...) to (B,) without mixing images.
 
-    Full steps without a line search, as the authors' optimiser; the first one moves x by `first_step` (root mean square),
-    none by more than `largest_step`.
+    Full steps without a line search, as the authors' optimiser; the first one moves x by `first_step` (root mean
+    square), none by more than `largest_step`.
     Returns the best x seen (B, ...) and its loss (B,). One evaluation per iteration, and one for the last point.
     """
     x = start.detach().clone()

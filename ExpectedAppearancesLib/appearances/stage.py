@@ -68,9 +68,9 @@ def synthesize_case(
             for item in part
         ]
 
-        def report(iteration: int, at=finished, count=len(part), style=part[0]["style"]) -> None:
-            fraction = (at + count * iteration / max(1, iterations)) / len(planned)
-            progress(fraction, f"appearance {at + 1} of {len(planned)}, texture {style}")
+        def report(iteration: int, at=finished, part=part) -> None:
+            fraction = (at + len(part) * iteration / max(1, iterations)) / len(planned)
+            progress(fraction, f"appearance {at + 1} of {len(planned)}, texture {part[0]['style']}")
 
         for item, (image, distance) in zip(part, synthesizer.run(jobs, report), strict=True):
             files.write_png(folder / item["image"], image)

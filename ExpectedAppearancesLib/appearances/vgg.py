@@ -59,7 +59,7 @@ class VggFeatures(torch.nn.Module):
 
 
 def load_vgg(weights_path: Path | None = None, compute_dtype: torch.dtype = torch.float32) -> VggFeatures:
-    """The shipped VGG-16, or the weights of a file: torchvision's vgg16/vgg19 .pth, or .safetensors. Raises InputError."""
+    """The shipped VGG-16, or a file's: torchvision's vgg16 / vgg19 .pth, or .safetensors. Raises InputError."""
     path = Path(weights_path) if weights_path else SHIPPED_WEIGHTS
     if not path.is_file():
         raise InputError(
@@ -105,7 +105,7 @@ def download_vgg19(folder: Path) -> Path:
 
 
 def _from_torchvision(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """torchvision's vggNN state -> convB_K names, and its RGB 0..1 input with per-channel scale -> BGR 0..255 - mean."""
+    """torchvision's state -> convB_K names, and its standardised RGB 0..1 input -> BGR 0..255 minus the mean."""
     indices = sorted(
         {int(key.split(".")[1]) for key in tensors if key.startswith("features.") and key.endswith("weight")}
     )

@@ -9,8 +9,8 @@ def add_parser(subparsers) -> None:
     parser = subparsers.add_parser(
         "register",
         help="find the pose of microscope frames",
-        description="Finds the pose of each frame with the case's trained model and writes poses.json. A frame whose pose "
-        "cannot be trusted is refused (accepted: false). Images may be PNG, JPEG or TIFF of any size.",
+        description="Finds the pose of each frame with the case's trained model and writes poses.json. A frame whose "
+        "pose cannot be trusted is refused (accepted: false). Images may be PNG, JPEG or TIFF of any size.",
     )
     parser.add_argument("case", metavar="CASE", help="case folder")
     parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE", help="microscope frames")

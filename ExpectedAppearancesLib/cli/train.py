@@ -9,8 +9,8 @@ def add_parser(subparsers) -> None:
     parser = subparsers.add_parser(
         "train",
         help="train the pose network on the expected appearances",
-        description="Trains the patient's pose network P_Omega and exports it to ONNX. Interrupted, it goes on where it "
-        "was. Chooses its epoch on poses and a texture that it does not train on.",
+        description="Trains the patient's pose network P_Omega and exports it to ONNX. Interrupted, it goes on where "
+        "it was. Chooses its epoch on poses and a texture that it does not train on.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("case", metavar="CASE", help="case folder")

@@ -31,8 +31,9 @@ def offscreen_window(width: int, height: int):
 class MaskRenderer:
     """Draws label maps: 0 background, 1 parenchyma, 2 vessels. Vessels behind the parenchyma are hidden.
 
-    vessels, parenchyma: surfaces in world mm. camera: size and A of the maps (distortion ignored: frames are undistorted).
-    circular_field: keep only a circle of radius `circular_field` x height, the microscope's field (the authors use 1/3).
+    vessels, parenchyma: surfaces in world mm. camera: size and A of the maps; its distortion is ignored, since
+    frames are undistorted. circular_field: keep only a circle of radius `circular_field` x height, the microscope's
+    field (the authors use 1/3).
     Works with no display, on EGL or OSMesa. Not thread-safe; close it, or use it as a context manager.
     """
 

@@ -67,7 +67,7 @@ def render_case(
     craniotomy: Craniotomy | None = None,
     circular_field: float | None = None,
 ) -> None:
-    """Sample `poses` poses and write their label maps; goes on where an interrupted run of the same settings stopped."""
+    """Sample `poses` poses and write their label maps; goes on where an interrupted run of the settings stopped."""
     if poses < 1:
         raise InputError(f"poses: {poses}; give at least 1.")
     craniotomy = craniotomy or find_craniotomy(case.vessels, case.cortex, case.space)

@@ -14,8 +14,8 @@ from ..geometry.pose import pose_from_rotation, rotation_matrix, rotation_vector
 class PoseEncoding:
     """reference_rotation (3, 3): the case's mean view, so that relative rotation vectors stay far from the cut at pi.
 
-    centre_world_mm (3,): mesh centroid. scale_mm: unit of surface coordinates. translation_mean_mm, translation_scale_mm:
-    of the centroid in the camera frame, over the sampled poses.
+    centre_world_mm (3,): mesh centroid. scale_mm: unit of surface coordinates. translation_mean_mm,
+    translation_scale_mm: of the centroid in the camera frame, over the sampled poses.
     """
 
     reference_rotation: np.ndarray

@@ -18,7 +18,7 @@ PARITY = 1e-4
 
 
 def export_model(network: torch.nn.Module, preset: Preset, meta: dict, folder: Path) -> None:
-    """Write model.onnx and model.json; raises ExpectedAppearancesError when onnxruntime disagrees with torch by 1e-4."""
+    """Write model.onnx and model.json; raises ExpectedAppearancesError when onnxruntime and torch differ by 1e-4."""
     network = network.eval().to(memory_format=torch.contiguous_format)
     example = torch.rand(1, 3, preset.size_px, preset.size_px, generator=torch.Generator().manual_seed(0))
     with files.replacing(folder / MODEL_NAME) as temporary:

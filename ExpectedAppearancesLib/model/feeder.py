@@ -23,7 +23,7 @@ TIMEOUT_S = 300.0
 
 @dataclass(frozen=True)
 class Batch:
-    """images uint8 (B, S, S, 3); camera_from_world (B, 4, 4); points_mm float32 (B, G, G, 3); surface, vessels (B, G, G)."""
+    """images uint8 (B, S, S, 3); camera_from_world (B, 4, 4); points_mm (B, G, G, 3); surface, vessels (B, G, G)."""
 
     images: np.ndarray
     camera_from_world: np.ndarray

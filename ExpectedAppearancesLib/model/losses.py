@@ -18,7 +18,8 @@ def dense_loss(
     output: torch.Tensor, points_mm: torch.Tensor, surface: torch.Tensor, vessels: torch.Tensor, encoding: PoseEncoding
 ) -> torch.Tensor:
     """Negative log-likelihood of the surface points, whose distance from the prediction falls off as exp(-d / sigma) in
-    space, plus cross-entropy of surface and vessels. output (B, 6, G, G); points_mm (B, G, G, 3); surface, vessels (B, G, G).
+    space, plus cross-entropy of surface and vessels. output (B, 6, G, G); points_mm (B, G, G, 3); surface and vessels
+    (B, G, G).
     """
     centre = torch.as_tensor(encoding.centre_world_mm, dtype=torch.float32, device=output.device)
     target = ((points_mm - centre) / encoding.scale_mm).permute(0, 3, 1, 2)

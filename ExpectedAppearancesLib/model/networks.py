@@ -8,7 +8,7 @@ from torch import nn
 
 
 class PaperRegressor(nn.Module):
-    """The paper's P_Omega: three blocks of (conv, conv, ReLU), average pooling after all but the last, then 128-64-32-6."""
+    """The paper's P_Omega: 3 blocks of (conv, conv, ReLU), average pooling after all but the last, then 128-64-32-6."""
 
     def __init__(self, size_px: int, channels: tuple[int, int, int] = (16, 32, 64)):
         super().__init__()

@@ -10,9 +10,9 @@ class Preset:
     """estimator: 'regression' (the paper's network) or 'dense' (surface coordinates, then PnP).
 
     size_px: side of the square network input. fresh: new views in each batch; the others are drawn from the last
-    `remembered` views, since rendering on a CPU costs as much as training does. minutes: the schedule ends at `steps` or at this time, whichever is
-    first. fresh_poses: every training image is seen from a pose of its own. negatives: share of images that show
-    something else, for which no surface may be found.
+    `remembered` views, since rendering on a CPU costs as much as training does. minutes: the schedule ends at `steps`
+    or at this time, whichever is first. fresh_poses: every new view has a pose of its own. negatives: share of views
+    that show something else, for which no surface may be found.
     """
 
     name: str

@@ -29,7 +29,7 @@ MIX_CLASSES = 0.35  # share of views whose vessels and parenchyma come from diff
 @dataclass(frozen=True)
 class View:
     """image uint8 (S, S, 3); camera_from_world (4, 4); on the grid of half the size: points_mm float32 (G, G, 3), the
-    surface point seen in world mm relative to nothing; surface, vessels uint8 (G, G). A negative view has no surface."""
+    surface point seen, world mm; surface, vessels uint8 (G, G). A negative view has no surface."""
 
     image: np.ndarray
     camera_from_world: np.ndarray

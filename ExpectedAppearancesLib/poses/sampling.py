@@ -89,8 +89,8 @@ class PoseSampler:
             if self.share_in_view(pose) >= self.ranges.in_view_min:
                 return pose
         raise InputError(
-            f"poses: in {MAX_TRIES} tries no view held {self.ranges.in_view_min:.0%} of the vessels; check that vessels "
-            "and camera belong together, or choose a larger working distance or a smaller lateral offset."
+            f"poses: in {MAX_TRIES} tries no view held {self.ranges.in_view_min:.0%} of the vessels; check that "
+            "vessels and camera belong together, or choose a larger working distance or a smaller lateral offset."
         )
 
     def share_in_view(self, camera_from_world: np.ndarray) -> float:

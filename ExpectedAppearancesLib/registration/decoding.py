@@ -1,4 +1,4 @@
-"""From the network's output to a pose and the evidence for it. Numpy only; shared by training and the operating room."""
+"""From the network's output to a pose and the evidence for it. Numpy only; used in training and in the OR."""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ ITERATIONS = 12
 
 @dataclass(frozen=True)
 class PoseFit:
-    """camera_from_world (4, 4); covariance (6, 6) of (rotation vector in the camera frame about the points' centre, rad;
-    translation, mm), as if all residuals were independent; inlier_share; residual: robust mean of |residual| / sigma."""
+    """camera_from_world (4, 4); covariance (6, 6) of (rotation vector in the camera frame about the points' centre,
+    rad; translation, mm), as if all residuals were independent; inlier_share; residual: mean of |residual| / sigma."""
 
     camera_from_world: np.ndarray
     covariance: np.ndarray

@@ -108,7 +108,7 @@ def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
     """A scaled to a frame of width x height px. Raises InputError when the frame has another aspect ratio."""
     if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
         raise InputError(
-            f"the frame is {width} x {height} px, the camera {camera.width} x {camera.height} px: another aspect ratio; "
-            "give the intrinsics of these frames with --camera, or crop the frames as when the camera was calibrated."
+            f"the frame is {width} x {height} px, the camera {camera.width} x {camera.height} px: another "
+            "aspect ratio; give the intrinsics of these frames with --camera, or crop the frames as when the camera was calibrated."
         )
     return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
