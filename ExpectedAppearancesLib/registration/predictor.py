@@ -109,6 +109,6 @@ def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
     if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
         raise InputError(
             f"the frame is {width} x {height} px, the camera {camera.width} x {camera.height} px: another "
-            "aspect ratio; give the intrinsics of these frames with --camera, or crop the frames as when the camera was calibrated."
+            "aspect ratio; give the intrinsics of these frames with --camera, or crop the frames as the camera was."
         )
     return camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
