@@ -1,9 +1,13 @@
+import json
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from cases import camera, dome, vessels
 
-from ExpectedAppearancesLib.case.meshes import Mesh
+from ExpectedAppearancesLib.case.meshes import Mesh, read_mesh
+from ExpectedAppearancesLib.geometry.camera import read_camera
 from ExpectedAppearancesLib.geometry.pose import look_at, transform
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 
@@ -72,3 +76,17 @@ def test_circular_field_keeps_a_circle_only():
     rows, columns = np.mgrid[0:96, 0:96]
     inside = np.hypot(rows - 47.5, columns - 47.5) <= 32
     assert (labels[inside] > 0).all() and not labels[~inside].any()
+
+
+CORTEX = Path(__file__).parents[2] / "shared" / "data" / "cortex"
+
+
+@pytest.mark.skipif(not CORTEX.is_dir(), reason="the real patient's case is not beside this checkout")
+def test_real_frames_are_black_where_the_map_says_background():
+    frames = json.loads((CORTEX / "poses.json").read_text(encoding="utf-8"))["frames"][::97]
+    meshes = [read_mesh(CORTEX / f"{name}.vtp", name) for name in ("vessels", "cortex")]
+    with MaskRenderer(*meshes, read_camera(CORTEX / "camera.json")) as renderer:
+        for frame in frames:
+            lit = cv2.imread(str(CORTEX / frame["image"]), cv2.IMREAD_GRAYSCALE) > 25
+            surface = renderer.render(np.array(frame["camera_from_world"])) > 0
+            assert (lit & surface).sum() / (lit | surface).sum() > 0.93
