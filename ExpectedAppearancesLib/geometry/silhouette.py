@@ -1,0 +1,43 @@
+"""The outline of a surface as a camera in perspective sees it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Silhouette:
+    """Edges of a surface between a triangle that faces the camera and one that does not, and its border edges.
+
+    The edges are matched to triangles once, so that asking again for another pose is fast.
+    vertices_mm (N, 3), triangles (F, 3) indices of vertices.
+    """
+
+    def __init__(self, vertices_mm: np.ndarray, triangles: np.ndarray):
+        self._vertices_mm = np.asarray(vertices_mm, float)
+        a, b, c = (self._vertices_mm[triangles[:, i]] for i in range(3))
+        self._face_normals, self._face_points_mm = np.cross(b - a, c - a), a
+        edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+        count = len(self._vertices_mm)
+        keys, self._edge_of_side = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
+        self._edges = np.stack([keys // count, keys % count], axis=1)
+        self._sides = np.bincount(self._edge_of_side, minlength=len(keys))
+
+    def edges(self, camera_from_world: np.ndarray) -> np.ndarray:
+        """(E, 2) indices of the vertices of the outline's edges, from an OpenCV pose. Hidden outlines are included."""
+        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+        towards = np.einsum("ij,ij->i", self._face_normals, centre_mm - self._face_points_mm) > 0
+        facing = np.bincount(self._edge_of_side, np.tile(towards, 3), minlength=len(self._edges))
+        return self._edges[(self._sides == 1) | ((facing > 0) & (facing < self._sides))]
+
+    def on_plane(self, camera_from_world: np.ndarray, plane_depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
+        """The outline seen from the pose, drawn on the plane z = plane_depth_mm of the camera.
+
+        Returns points (P, 3), camera mm, and lines (E, 2) indices of points. What lies nearer to the camera than a
+        hundredth of the plane is left out: it has no place on the plane.
+        """
+        points_mm = self._vertices_mm @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        edges = self.edges(camera_from_world)
+        edges = edges[(points_mm[edges, 2] > plane_depth_mm / 100).all(axis=1)]
+        used, lines = np.unique(edges, return_inverse=True)
+        points_mm = points_mm[used]
+        return points_mm * (plane_depth_mm / points_mm[:, 2:3]), lines.reshape(-1, 2)

@@ -1,0 +1,247 @@
+"""A registered frame as a 3D Slicer scene: the only place of the library that touches MRML.
+
+The scene's world is RAS, mm. The frame, its frustum and the predicted outline lie in camera mm (OpenCV axes) under one
+linear transform, 'CameraToRAS': a new pose moves them all. A Slicer module calls the add_... functions with its own
+scene and the set_... functions for each new frame; none of them needs more than the scene.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from ..case.case import Case
+from ..case.meshes import Mesh
+from ..errors import ExpectedAppearancesError, InputError
+from ..geometry.camera import Camera
+from ..geometry.pose import RAS_FROM_LPS, camera_to_ras, is_rigid, transform
+from ..geometry.silhouette import Silhouette
+
+VESSELS, CORTEX = "Vessels", "Cortex"
+FRAME, FRUSTUM, OUTLINE = "Microscope frame", "Camera frustum", "Predicted outline"
+CAMERA_TO_RAS = "CameraToRAS"
+COLOURS = {VESSELS: (0.82, 0.13, 0.15), CORTEX: (0.90, 0.75, 0.68), FRUSTUM: (1.0, 0.82, 0.2), OUTLINE: (0.15, 1, 0.3)}
+
+
+def save_registered_scene(
+    case: Case, image_rgb: np.ndarray, camera: Camera, camera_from_world: np.ndarray, path: Path
+) -> Path:
+    """Write the case's models and one registered frame as a .mrb that Slicer opens; returns its path.
+
+    image_rgb: uint8 (H, W, 3) of the camera's size; a distorted frame is undistorted, since an image plane is flat.
+    camera_from_world: 4x4, mm, OpenCV camera, world = the case's files. An existing scene is replaced as a whole.
+    Raises InputError: slicer-core missing, wrong image or pose, vessels behind the camera, `path` not writable.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".mrb":
+        raise InputError(f"{path}: scenes are saved as Slicer's bundles; give a name that ends in .mrb.")
+    _check_frame(image_rgb, camera)
+    pose = np.asarray(camera_from_world, float)
+    plane_mm = plane_depth_mm(case.vessels, pose)
+    scene = new_scene()
+    add_case_models(scene, case)
+    parent = add_camera_transform(scene, camera_to_ras(pose, case.space))
+    add_frame(scene, image_rgb, camera, plane_mm, parent)
+    add_frustum(scene, camera, plane_mm, parent)
+    add_outline(scene, Silhouette(case.vessels.vertices_mm, case.vessels.triangles), pose, plane_mm, parent)
+    write_bundle(scene, path)
+    return path
+
+
+def new_scene():
+    """An empty vtkMRMLScene. Raises InputError where neither Slicer nor slicer-core is there."""
+    try:
+        import slicer
+    except ImportError as error:
+        raise InputError(
+            f"Slicer scene: the package slicer-core cannot be loaded ({error}); "
+            "install the `scene` extra: pip install slicer-core."
+        ) from error
+    return slicer.vtkMRMLScene()
+
+
+def plane_depth_mm(vessels: Mesh, camera_from_world: np.ndarray) -> float:
+    """Distance from the camera, mm, at which the frame is put up: the median depth of the vessels' vertices.
+
+    Raises InputError for a pose that is not rigid or has the vessels behind the camera.
+    """
+    if not is_rigid(camera_from_world):
+        raise InputError("camera_from_world: not a rigid 4x4 pose; give a rotation and a translation in mm.")
+    depth_mm = float(np.median(transform(camera_from_world, vessels.vertices_mm)[:, 2]))
+    if depth_mm <= 0:
+        raise InputError(
+            f"camera_from_world: the vessels lie {-depth_mm:.0f} mm behind the camera; give the pose with OpenCV axes "
+            "(x right, y down, z forward), from world to camera."
+        )
+    return depth_mm
+
+
+def add_case_models(scene, case: Case) -> dict:
+    """Add the models 'Vessels' and, where the case has one, 'Cortex', in RAS mm; returns the nodes by name."""
+    ras_from_world = RAS_FROM_LPS if case.space == "LPS" else np.eye(4)
+    nodes = {}
+    for name, mesh in ((VESSELS, case.vessels), (CORTEX, case.cortex)):
+        if mesh is not None:
+            in_ras = Mesh(transform(ras_from_world, mesh.vertices_mm), mesh.triangles)
+            nodes[name] = _add_model(scene, name, in_ras.to_polydata())
+    if CORTEX in nodes:
+        nodes[CORTEX].GetDisplayNode().SetOpacity(0.4)  # vessels below the surface stay visible
+    return nodes
+
+
+def add_camera_transform(scene, camera_to_ras_matrix: np.ndarray):
+    """Add the linear transform 'CameraToRAS': camera mm (OpenCV axes) to RAS mm, 4x4."""
+    node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", CAMERA_TO_RAS)
+    set_pose(node, camera_to_ras_matrix)
+    return node
+
+
+def set_pose(transform_node, camera_to_ras_matrix: np.ndarray) -> None:
+    transform_node.SetMatrixTransformToParent(_vtk_matrix(camera_to_ras_matrix))
+
+
+def add_frame(scene, image_rgb: np.ndarray, camera: Camera, plane_mm: float, parent):
+    """Add the vector volume 'Microscope frame' on the plane z = plane_mm of the camera, under the transform `parent`.
+
+    Its IJKToRAS puts the centre of pixel (u, v) = (i, j) where the ray of that pixel meets the plane, in camera mm.
+    Raises InputError when image_rgb is not uint8 (H, W, 3) of the camera's size.
+    """
+    node = scene.AddNewNodeByClass("vtkMRMLVectorVolumeNode", FRAME)
+    node.SetIJKToRASMatrix(_vtk_matrix(camera_from_pixel(camera, plane_mm)))
+    set_frame(node, image_rgb, camera)
+    node.CreateDefaultDisplayNodes()
+    node.GetDisplayNode().SetAutoWindowLevel(False)
+    node.GetDisplayNode().SetWindowLevelMinMax(0, 255)
+    node.SetAndObserveTransformNodeID(parent.GetID())
+    return node
+
+
+def set_frame(frame_node, image_rgb: np.ndarray, camera: Camera) -> None:
+    """Give the volume new pixels, undistorted where the camera is distorted."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+
+    _check_frame(image_rgb, camera)
+    if camera.is_distorted:
+        from ..evaluation.overlays import undistorted
+
+        image_rgb = undistorted(image_rgb, camera)
+    data = vtkImageData()
+    data.SetDimensions(camera.width, camera.height, 1)
+    # Row v of the image is row j of the volume: no flip, the top of the frame is j = 0.
+    scalars = numpy_to_vtk(np.ascontiguousarray(image_rgb).reshape(-1, 3), deep=True)
+    scalars.SetName("ImageScalars")
+    data.GetPointData().SetScalars(scalars)
+    frame_node.SetAndObserveImageData(data)
+
+
+def camera_from_pixel(camera: Camera, plane_mm: float) -> np.ndarray:
+    """4x4: pixel (u, v, 0, 1) -> camera mm on the plane z = plane_mm. Pixel centres at integers, distortion ignored."""
+    across, down = plane_mm / camera.fx, plane_mm / camera.fy
+    matrix = np.diag([across, down, (across + down) / 2, 1.0])  # k forward: right-handed with x right, y down
+    matrix[:3, 3] = -camera.cx * across, -camera.cy * down, plane_mm
+    return matrix
+
+
+def add_frustum(scene, camera: Camera, plane_mm: float, parent):
+    """Add the line model 'Camera frustum': from the camera's centre to the outer edges of the frame on its plane."""
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    corners = np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
+    points_mm = np.vstack([np.zeros(3), transform(camera_from_pixel(camera, plane_mm), corners)])
+    lines = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])
+    node = _add_model(scene, FRUSTUM, _line_polydata(points_mm, lines), parent)
+    node.GetDisplayNode().SetLighting(False)
+    return node
+
+
+def add_outline(scene, silhouette: Silhouette, camera_from_world: np.ndarray, plane_mm: float, parent):
+    """Add the line model 'Predicted outline': the vessels' perspective outline, on the frame's plane in camera mm.
+
+    Slicer projects models onto slices in parallel; on the frame's own plane that equals the camera's view.
+    """
+    node = _add_model(scene, OUTLINE, _outline(silhouette, camera_from_world, plane_mm), parent)
+    display = node.GetDisplayNode()
+    display.SetLighting(False)
+    display.SetLineWidth(2)
+    display.SetVisibility2D(True)
+    display.SetSliceDisplayModeToProjection()
+    display.SetSliceIntersectionThickness(2)
+    return node
+
+
+def set_outline(outline_node, silhouette: Silhouette, camera_from_world: np.ndarray, plane_mm: float) -> None:
+    """Redraw the outline for a new pose."""
+    outline_node.SetAndObservePolyData(_outline(silhouette, camera_from_world, plane_mm))
+
+
+def write_bundle(scene, path: Path) -> None:
+    """Save the scene with all its data as one .mrb, whole or not at all. Raises InputError when it cannot."""
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Under its final name in a folder of its own: Slicer names the scene inside the bundle after the file.
+        with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", suffix=".part", dir=path.parent) as folder:
+            temporary = Path(folder) / path.name
+            if not scene.WriteToMRB(str(temporary)) or not temporary.is_file():
+                raise ExpectedAppearancesError(
+                    f"{path}: Slicer could not save the scene; free some space, or choose a shorter path."
+                )
+            os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}); "
+            "free some space or choose a folder you may write to."
+        ) from error
+
+
+def _check_frame(image_rgb: np.ndarray, camera: Camera) -> None:
+    wanted = (camera.height, camera.width, 3)
+    if image_rgb.dtype != np.uint8 or image_rgb.shape != wanted:
+        raise InputError(
+            f"frame: {image_rgb.dtype} of shape {image_rgb.shape} does not fit the camera; "
+            f"give uint8 RGB of shape {wanted}, or the camera of this frame size."
+        )
+
+
+def _outline(silhouette: Silhouette, camera_from_world: np.ndarray, plane_mm: float):
+    return _line_polydata(*silhouette.on_plane(np.asarray(camera_from_world, float), plane_mm))
+
+
+def _add_model(scene, name: str, polydata, parent=None):
+    node = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
+    node.SetAndObservePolyData(polydata)
+    node.CreateDefaultDisplayNodes()
+    node.GetDisplayNode().SetColor(*COLOURS[name])
+    if parent is not None:
+        node.SetAndObserveTransformNodeID(parent.GetID())
+    return node
+
+
+def _line_polydata(points_mm: np.ndarray, lines: np.ndarray):
+    """vtkPolyData of points (P, 3) and lines (E, 2), in memory of its own."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(points_mm, np.float64), deep=True))
+    cells = vtkCellArray()
+    cells.SetData(
+        numpy_to_vtkIdTypeArray(np.arange(0, 2 * len(lines) + 1, 2, dtype=np.int64), deep=True),
+        numpy_to_vtkIdTypeArray(np.ascontiguousarray(lines.ravel(), np.int64), deep=True),
+    )
+    polydata = vtkPolyData()
+    polydata.SetPoints(points)
+    polydata.SetLines(cells)
+    return polydata
+
+
+def _vtk_matrix(matrix: np.ndarray):
+    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+    result = vtkMatrix4x4()
+    result.DeepCopy(np.asarray(matrix, float).ravel().tolist())
+    return result
