@@ -21,7 +21,8 @@ MURRAY_EXPONENT = 3  # Murray, PNAS 1926: r0^3 = r1^3 + r2^3 where the flow's co
 STEP_MM = 0.5
 RING_VERTICES = 12
 CENTRE_ABOVE_SURFACE = 0.3  # of the radius: a little less than half of the tube is sunk in the cortex
-WALKS_TRIED = 8
+WALKS_TRIED = 6
+TREES_TRIED = 3
 SHORTEST_STEPS = 8
 CLEARANCE_MM = 1.5  # between the walls of two vessels
 FAMILY_MM = 3.5
@@ -90,6 +91,13 @@ def generate_tree(seed: int) -> tuple[CortexPatch, list[Branch]]:
     """The patch and its vessels; parents come before their children."""
     rng = np.random.default_rng([seed, 3])
     patch = _generate_patch(rng)
+    # Vessels that grow first may shut out the others: of a few trees, the one that covers most of the patch.
+    return patch, max(
+        (_grow(rng) for _ in range(TREES_TRIED)), key=lambda tree: sum(len(b.centre_line_mm) for b in tree)
+    )
+
+
+def _grow(rng: np.random.Generator) -> list[Branch]:
     branches: list[Branch] = []
     half = PATCH_SIDE_MM / 2
     first_side = rng.integers(4)
@@ -108,7 +116,7 @@ def generate_tree(seed: int) -> tuple[CortexPatch, list[Branch]]:
     while index < len(branches):
         branches += _children(branches, index, rng)
         index += 1
-    return patch, branches
+    return branches
 
 
 def tree_mesh(patch: CortexPatch, branches: list[Branch]) -> Mesh:
@@ -146,7 +154,7 @@ def _children(branches: list[Branch], index: int, rng: np.random.Generator) -> l
     end = parent.centre_line_mm[-1]
     ahead = math.atan2(*(end - parent.centre_line_mm[-2])[::-1])
     best: list[Branch] = []
-    for turn in (-1, 1):
+    for turn in (-1, 1, -1, 1):
         # The thinner child turns further away, as Murray's law has it.
         first = Branch(_walk(branches, end, ahead - turn * rng.uniform(0.2, 0.5), thick, rng), thick, index)
         second_heading = ahead + turn * rng.uniform(0.7, 1.1)
@@ -172,7 +180,7 @@ def _walk(branches: list[Branch], start, heading: float, radius_mm: float, rng: 
         drift = rng.normal(0, 0.05)
         while len(line) <= steps:
             # The bend returns to 0, so that a vessel winds about its course and does not curl up.
-            drift = 0.9 * drift + rng.normal(0, 0.045) - 0.012 * bend
+            drift = 0.9 * drift + rng.normal(0, 0.042) - 0.018 * bend
             bend += drift
             point = line[-1] + STEP_MM * np.array([math.cos(heading + bend), math.sin(heading + bend)])
             if np.abs(point).max() > PATCH_SIDE_MM / 2 or (np.linalg.norm(points - point, axis=1) < nearest_mm).any():
