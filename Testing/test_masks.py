@@ -89,4 +89,5 @@ def test_real_frames_are_black_where_the_map_says_background():
         for frame in frames:
             lit = cv2.imread(str(CORTEX / frame["image"]), cv2.IMREAD_GRAYSCALE) > 25
             surface = renderer.render(np.array(frame["camera_from_world"])) > 0
-            assert (lit & surface).sum() / (lit | surface).sum() > 0.85  # the patch was recovered from the frames: its rim is ragged
+            # The patch was recovered from the frames: its rim is ragged.
+            assert (lit & surface).sum() / (lit | surface).sum() > 0.85
