@@ -11,8 +11,8 @@ def add_parser(subparsers) -> None:
         "demo",
         help="run the whole pipeline on a small generated case",
         description="Generates a vessel tree on a curved cortex and test frames painted in ways that are never trained "
-        "on, then runs every stage, offline and on a CPU: new, render, synthesize, train, register, evaluate. Ends with "
-        "overlays (PNG), a report and a scene for 3D Slicer. Started again, it goes on where it was.",
+        "on, then runs every stage, offline and on a CPU: new, render, synthesize, train, register, evaluate. Ends "
+        "with overlays (PNG), a report and a scene for 3D Slicer. Started again, it goes on where it was.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument(
