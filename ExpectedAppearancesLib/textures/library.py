@@ -54,7 +54,8 @@ def read_library(folder: Path, exclude: Iterable[str] = ()) -> list[Texture]:
     unknown = sorted(exclude - set(images))
     if unknown:
         problems.add(
-            f"{folder}: no texture is called {', '.join(unknown)}, so it cannot be excluded; there are {', '.join(images)}."
+            f"{folder}: no texture is called {', '.join(unknown)}, so it cannot be excluded; "
+            f"there are {', '.join(images)}."
         )
     shared_path = folder / SHARED_LABELS
     shared_labels, shared_failed = None, False
@@ -108,7 +109,8 @@ def check_texture(path: Path, image: np.ndarray, labels_path: Path, labels: np.n
     if foreign:
         shown = ", ".join(str(value) for value in foreign[:5])
         found.append(
-            f"{labels_path}: holds the value(s) {shown}; only 0 (background), 1 (parenchyma) and 2 (vessels) are allowed."
+            f"{labels_path}: holds the value(s) {shown}; "
+            "only 0 (background), 1 (parenchyma) and 2 (vessels) are allowed."
         )
     for label, class_name in CLASS_NAMES.items():
         count = int((labels == label).sum())
@@ -137,5 +139,5 @@ def _image_paths(folder: Path) -> dict[str, Path]:
         raise InputError(f"{folder}: holds no textures; put NAME.png with NAME{LABELS_SUFFIX} there.")
     # Natural order, so that texture 10 follows 9.
     return dict(
-        sorted(images.items(), key=lambda item: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", item[0])])
+        sorted(images.items(), key=lambda item: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", item[0])])
     )
