@@ -243,17 +243,18 @@ class ExpectedAppearancesLogic(ScriptedLoadableModuleLogic):
         from ExpectedAppearancesLib.geometry.silhouette import Silhouette
         from ExpectedAppearancesLib.mrml import scene
 
-        image, camera = scene.undistorted(files.read_image_rgb(frame.image), camera)
-        plane_mm = scene.plane_depth_mm(case.vessels, frame.camera_from_world)
-        cameraToRas = camera_to_ras(frame.camera_from_world, case.space)
+        image = files.read_image_rgb(frame.image)
+        camera = camera.resized(image.shape[1], image.shape[0])
+        pose = frame.camera_from_world
+        plane_mm = scene.plane_depth_mm(case.vessels, pose)
+        cameraToRas = camera_to_ras(pose, case.space)
+        silhouette = Silhouette(case.vessels.vertices_mm, case.vessels.triangles)
 
         def add():
             parent = scene.add_camera_transform(slicer.mrmlScene, cameraToRas)
             volume = scene.add_frame(slicer.mrmlScene, image, camera, plane_mm, parent)
             scene.add_frustum(slicer.mrmlScene, camera, plane_mm, parent)
-            silhouette = Silhouette(case.vessels.vertices_mm, case.vessels.triangles)
-            scene.add_outline(slicer.mrmlScene, silhouette, parent)
-            scene.set_outline(slicer.mrmlScene, frame.camera_from_world, plane_mm)
+            scene.add_outline(slicer.mrmlScene, silhouette, pose, plane_mm, parent)
             return volume
 
         volume = self._addMarked(SHOWN_FRAME, add)
@@ -261,14 +262,20 @@ class ExpectedAppearancesLogic(ScriptedLoadableModuleLogic):
 
     def _lookAtFrame(self, volume, camera, plane_mm, cameraToRas):
         """Turn the Red slice, where there is one, to the image plane, and draw it in 3D."""
+        from ExpectedAppearancesLib.mrml import scene
+
         sliceNode = slicer.mrmlScene.GetNodeByID("vtkMRMLSliceNodeRed")
         compositeNode = slicer.mrmlScene.GetNodeByID("vtkMRMLSliceCompositeNodeRed")
         if sliceNode is None or compositeNode is None:
             return
-        # Slice views sample at the corners of their pixels: with this pixel at the origin the frame stays sharp.
-        x, y = (camera.width / 2 - camera.cx) / camera.fx, (camera.height / 2 - 1 - camera.cy) / camera.fy
         planeToCamera = np.diag([1.0, -1.0, -1.0, 1.0])  # the slice's y points up, the camera's down
-        planeToCamera[:3, 3] = plane_mm * x, plane_mm * y, plane_mm
+        # Slice views sample at the corners of their pixels: with this pixel at the origin the frame stays sharp.
+        planeToCamera[:, 3] = scene.camera_from_pixel(camera, plane_mm) @ [
+            camera.width / 2,
+            camera.height / 2 - 1,
+            0,
+            1,
+        ]
         slicer.util.updateVTKMatrixFromArray(sliceNode.GetSliceToRAS(), cameraToRas @ planeToCamera)
         sliceNode.UpdateMatrices()
         width, height = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy

@@ -29,6 +29,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/cli/synthesize.py
   ExpectedAppearancesLib/cli/train.py
   ExpectedAppearancesLib/demo/__init__.py
+  ExpectedAppearancesLib/demo/frames.py
   ExpectedAppearancesLib/demo/pipeline.py
   ExpectedAppearancesLib/demo/vessel_tree.py
   ExpectedAppearancesLib/errors.py
@@ -71,7 +72,9 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/registration/predictor.py
   ExpectedAppearancesLib/registration/record.py
   ExpectedAppearancesLib/textures/__init__.py
+  ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py
+  ExpectedAppearancesLib/textures/painting.py
   )
 set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md
