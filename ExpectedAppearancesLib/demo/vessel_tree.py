@@ -170,10 +170,11 @@ def _walk(branches: list[Branch], start, heading: float, radius_mm: float, rng: 
     """The longest of a few tortuous lines from `start`; each ends at the border or before another vessel."""
     points = np.vstack([b.centre_line_mm for b in branches]) if branches else np.zeros((0, 2))
     radii = np.repeat([b.radius_mm for b in branches], [len(b.centre_line_mm) for b in branches])
-    # At the branching its own family is always near.
-    away = np.linalg.norm(points - start, axis=1) > FAMILY_MM
-    points, nearest_mm = points[away], radii[away] + radius_mm + CLEARANCE_MM
     steps = rng.integers(18, 30)
+    distance_mm = np.linalg.norm(points - start, axis=1)
+    # At the branching its own family is always near; what is out of reach need not be looked at.
+    obstacle = (distance_mm > FAMILY_MM) & (distance_mm < steps * STEP_MM + 2 * max(ROOT_RADIUS_MM) + CLEARANCE_MM)
+    points, nearest_mm_2 = points[obstacle], (radii[obstacle] + radius_mm + CLEARANCE_MM) ** 2
     best = np.zeros((0, 2))
     for _ in range(WALKS_TRIED):
         line, bend = [start], 0.0
@@ -183,7 +184,7 @@ def _walk(branches: list[Branch], start, heading: float, radius_mm: float, rng: 
             drift = 0.9 * drift + rng.normal(0, 0.042) - 0.018 * bend
             bend += drift
             point = line[-1] + STEP_MM * np.array([math.cos(heading + bend), math.sin(heading + bend)])
-            if np.abs(point).max() > PATCH_SIDE_MM / 2 or (np.linalg.norm(points - point, axis=1) < nearest_mm).any():
+            if np.abs(point).max() > PATCH_SIDE_MM / 2 or (((points - point) ** 2).sum(axis=1) < nearest_mm_2).any():
                 break
             line.append(point)
         if len(line) > len(best):
