@@ -105,7 +105,7 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         self.setParameterNode(None)
 
     def onSceneEndClose(self, _caller, _event):
-        self.logic.hideFrame()
+        self.logic.hideAll()
         if self.parent.isEntered:
             self.initializeParameterNode()
 
@@ -125,8 +125,12 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
     def onPathChanged(self, _path=None):
         if not self._parameterNode:
             return
-        self.logic.hideFrame()  # it is not one of the new choice
         casePath, posesPath = self.ui.casePathLineEdit.currentPath, self.ui.posesPathLineEdit.currentPath
+        # What is shown does not belong to the new choice.
+        if casePath != self._parameterNode.casePath:
+            self.logic.hideAll()
+        elif posesPath != self._parameterNode.posesPath:
+            self.logic.hideFrame()
         self._parameterNode.casePath = casePath
         self._parameterNode.posesPath = posesPath
 
@@ -228,6 +232,10 @@ class ExpectedAppearancesLogic(ScriptedLoadableModuleLogic):
     def hideFrame(self):
         self.message = ""
         self._removeShown(lambda mark: mark == SHOWN_FRAME)
+
+    def hideAll(self):
+        self.message = ""
+        self._removeShown(lambda _mark: True)
 
     def _showCase(self, case):
         from ExpectedAppearancesLib.mrml import scene
@@ -332,8 +340,11 @@ class ExpectedAppearancesTest(ScriptedLoadableModuleTest):
         self.test_showsAcceptedFramesOnly()
 
     def test_panelSaysWhyItIsDisabled(self):
-        slicer.util.selectModule("ExpectedAppearances")
-        widget = slicer.modules.expectedappearances.widgetRepresentation().self()
+        widget = slicer.util.getModuleWidget("ExpectedAppearances")
+        if slicer.util.mainWindow(verbose=False):
+            slicer.util.selectModule("ExpectedAppearances")
+        else:
+            widget.enter()
         widget.ui.casePathLineEdit.currentPath = ""
         widget.ui.posesPathLineEdit.currentPath = ""
         self.assertFalse(widget.ui.showButton.enabled)

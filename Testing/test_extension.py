@@ -199,6 +199,19 @@ def test_shows_the_frame_in_the_place_of_the_last(module, tmp_path):
     assert len(marked(module)) == nodes
 
 
+def test_hiding_all_leaves_only_the_users_own_nodes(module, tmp_path):
+    import slicer
+
+    own = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLModelNode", "Vessels")
+    nodes = slicer.mrmlScene.GetNumberOfNodes()
+    logic = module.ExpectedAppearancesLogic()
+    assert logic.show(*module._writeTinyCase(tmp_path), 0), logic.message
+    logic.hideAll()
+    assert slicer.mrmlScene.GetNumberOfNodes() == nodes
+    assert slicer.mrmlScene.IsNodePresent(own)
+    assert logic.message == ""
+
+
 @pytest.mark.parametrize("index", [1, 7])
 def test_nothing_old_stays_when_a_frame_is_refused(module, tmp_path, index):
     logic = module.ExpectedAppearancesLogic()
