@@ -9,7 +9,8 @@ import pytest
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.textures.library import read_library
+from ExpectedAppearancesLib.textures import generate
+from ExpectedAppearancesLib.textures.library import Texture, read_library, shipped_textures_folder
 
 CORTEX_TEXTURES = Path(__file__).parents[2] / "shared/data/cortex/textures"
 
@@ -111,3 +112,51 @@ def test_reads_the_textures_of_the_cortex_case():
     textures = read_library(CORTEX_TEXTURES)
     assert len(textures) == 11
     assert all(t.image.shape == (512, 512, 3) and t.labels.shape == (512, 512) for t in textures)
+
+
+def test_shipped_textures_show_both_tissues_in_different_colours():
+    textures = read_library(shipped_textures_folder())
+    assert len(textures) >= 8
+    parenchyma_rgb = []
+    for texture in textures:
+        assert texture.image.shape == (512, 512, 3)
+        assert set(np.unique(texture.labels).tolist()) == {1, 2}
+        assert 0.05 <= texture.class_shares()["vessels"] <= 0.25, texture.name
+        means = [texture.image[texture.labels == label].mean(axis=0) for label in (1, 2)]
+        assert np.linalg.norm(means[0] - means[1]) > 30, texture.name
+        # Cortex is warm: swapped channels would make it blue.
+        assert means[0][0] > means[0][2] + 10, texture.name
+        parenchyma_rgb.append(means[0])
+    distances = np.linalg.norm(np.array(parenchyma_rgb)[:, None] - parenchyma_rgb, axis=-1)
+    assert distances[np.triu_indices(len(textures), 1)].min() > 8  # no two look alike
+
+
+def test_a_shipped_texture_is_what_the_generator_makes():
+    shipped = {texture.name: texture for texture in read_library(shipped_textures_folder())}
+    assert set(shipped) == set(generate.PALETTES)
+    made = generate.make_texture("dusk")
+    # OpenCV builds round differently: single pixels may flip at the rims.
+    assert (made.labels != shipped["dusk"].labels).mean() < 1e-4
+    off = np.abs(made.image.astype(int) - shipped["dusk"].image).max(axis=-1)
+    assert (off > 1).mean() < 1e-3
+
+
+def test_another_seed_paints_other_veins():
+    first, _ = generate.grow_veins(np.random.default_rng([0, 4]))
+    other, _ = generate.grow_veins(np.random.default_rng([1, 4]))
+    assert first.shape != other.shape or not np.allclose(first, other)
+
+
+def test_generate_writes_each_palette_for_the_given_seed(tmp_path, monkeypatch):
+    asked = []
+
+    def make(name, seed):
+        asked.append((name, seed))
+        return Texture(name, photo(), label_map())
+
+    monkeypatch.setattr(generate, "make_texture", make)
+    generate.generate(tmp_path, seed=5)
+    assert asked == [(name, 5) for name in sorted(generate.PALETTES)]
+    textures = read_library(tmp_path)
+    assert {texture.name for texture in textures} == set(generate.PALETTES)
+    np.testing.assert_array_equal(textures[0].image, photo())
