@@ -79,4 +79,24 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
 set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md
   ExpectedAppearancesLib/appearances/weights/vgg16_imagenet_to_conv5_1_fp16.safetensors
+  ExpectedAppearancesLib/textures/generated/apricot.labels.png
+  ExpectedAppearancesLib/textures/generated/apricot.png
+  ExpectedAppearancesLib/textures/generated/blush.labels.png
+  ExpectedAppearancesLib/textures/generated/blush.png
+  ExpectedAppearancesLib/textures/generated/clay.labels.png
+  ExpectedAppearancesLib/textures/generated/clay.png
+  ExpectedAppearancesLib/textures/generated/crimson.labels.png
+  ExpectedAppearancesLib/textures/generated/crimson.png
+  ExpectedAppearancesLib/textures/generated/dusk.labels.png
+  ExpectedAppearancesLib/textures/generated/dusk.png
+  ExpectedAppearancesLib/textures/generated/ivory.labels.png
+  ExpectedAppearancesLib/textures/generated/ivory.png
+  ExpectedAppearancesLib/textures/generated/mauve.labels.png
+  ExpectedAppearancesLib/textures/generated/mauve.png
+  ExpectedAppearancesLib/textures/generated/rosewood.labels.png
+  ExpectedAppearancesLib/textures/generated/rosewood.png
+  ExpectedAppearancesLib/textures/generated/slate.labels.png
+  ExpectedAppearancesLib/textures/generated/slate.png
+  ExpectedAppearancesLib/textures/generated/sunset.labels.png
+  ExpectedAppearancesLib/textures/generated/sunset.png
   )
