@@ -28,7 +28,7 @@ PACKAGES = (
     (("torch",), "synthesize and train"),
     (("safetensors",), "synthesize and train"),
     (("onnx",), "train"),
-    (("scikit-image",), "demo and synthesize"),
+    (("scipy",), "demo"),
     (("matplotlib",), "evaluate"),
     (("jinja2",), "evaluate and demo"),
     (("slicer-core",), ""),

@@ -1,0 +1,17 @@
+import pytest
+
+from ExpectedAppearancesLib.demo import pipeline
+from ExpectedAppearancesLib.errors import ExpectedAppearancesError, InputError
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match="is no demo"):
+        pipeline.run_demo(tmp_path, lambda *_: None)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_failing_stage_ends_the_demo_and_is_named(tmp_path):
+    """The stages are real commands in processes of their own: one with bad input must not be passed over."""
+    with pytest.raises(ExpectedAppearancesError, match="`render .*exit code 2"):
+        pipeline._run(["render", tmp_path / "no case"])
