@@ -13,5 +13,5 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
 
 def test_a_failing_stage_ends_the_demo_and_is_named(tmp_path):
     """The stages are real commands in processes of their own: one with bad input must not be passed over."""
-    with pytest.raises(ExpectedAppearancesError, match="`render .*exit code 2"):
+    with pytest.raises(ExpectedAppearancesError, match=r"`render .*exit code 2"):
         pipeline._run(["render", tmp_path / "no case"])
