@@ -15,6 +15,7 @@ from ExpectedAppearancesLib.appearances.vgg import load_vgg
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.masks.stage import render_case
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 from ExpectedAppearancesLib.textures.library import Texture
 
 CLASSES = (1, 2)
@@ -218,6 +219,20 @@ def test_a_killed_synthesis_goes_on_and_ends_as_if_it_had_not_been(case, method)
     synthesize_case(case, textures, lambda *_: None, method, size_px=48, iterations=4)
     for appearance in store.read_appearances(case, method)[1]:
         np.testing.assert_array_equal(files.read_image_rgb(appearance.image_path), images[appearance.image_path.name])
+
+
+def test_a_changed_texture_or_axis_is_not_passed_over(case):
+    def made(textures):
+        synthesize_case(case, textures, lambda *_: None, "surface", size_px=32, iterations=1)
+        return {a.style: a.image_path.stat().st_mtime_ns for a in store.read_appearances(case, "surface")[1]}
+
+    first = made([texture("a"), texture("b")])
+    assert made([texture("a"), texture("b")]) == first
+    second = made([texture("a"), texture("b", (10, 200, 10))])
+    assert second["a"] == first["a"] and second["b"] != first["b"]
+    render_case(case, lambda *_: None, 3, craniotomy=find_craniotomy(case.vessels, normal=[0.3, 0, 1]))
+    third = made([texture("a"), texture("b", (10, 200, 10))])
+    assert third["a"] != second["a"] and third["b"] != second["b"]
 
 
 def test_paper_preset_makes_every_pose_with_every_texture(case):

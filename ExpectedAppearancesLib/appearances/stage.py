@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -51,12 +52,20 @@ def synthesize_case(
         "iterations": iterations,
         "backbone": vgg.backbone,
         "weights_sha256": files.sha256(weights_file),
-        "render": case.manifest["stages"].get("render", {}).get("updated") if method == "image" else None,
+        # What the label maps depend on: an appearance on an older one is made again.
+        "overview": planned[0]["camera_from_world"] if method == "surface" else None,
+        "poses_sha256": files.sha256(case.poses_path) if method == "image" else None,
+        "circular_field": case.manifest["stages"].get("render", {}).get("circular_field"),
     }
     folder = store.folder_of(case, method)
     files.require_space(case.folder, len(planned) * size_px**2 * 2.5e-6 + 5)
     done = _finished_items(case, method, settings)
     synthesizer = Synthesizer(vgg, device, iterations)
+    digests = [_digest(texture) for texture in textures]
+    for item in planned:
+        item["texture_sha256"] = digests[item["texture"]]
+        if done.get(item["image"], item)["texture_sha256"] != item["texture_sha256"]:
+            del done[item["image"]]
     waiting = [item for item in planned if item["image"] not in done]
     case.record("synthesize", method=method, styles=sorted({t.name for t in textures}), images=len(planned), done=False)
     store.write_index(case, method, camera, settings, list(done.values()), done=False)
@@ -82,6 +91,10 @@ def synthesize_case(
     store.write_index(case, method, camera, settings, items, done=True)
     mean_distance = float(np.mean([item["gram_distance"] for item in items]))
     case.record("synthesize", done=True, **settings, gram_distance_mean=mean_distance)
+
+
+def _digest(texture: Texture) -> str:
+    return hashlib.sha256(texture.image.tobytes() + texture.labels.tobytes()).hexdigest()
 
 
 def _finished_items(case: Case, method: str, settings: dict) -> dict[str, dict]:

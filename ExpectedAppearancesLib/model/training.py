@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from .. import files
-from ..appearances.store import read_appearances
+from ..appearances.store import folder_of, read_appearances
 from ..case.case import Case
 from ..evaluation.metrics import add_mm
 from ..masks.stage import craniotomy_of, sampler_of
@@ -98,8 +98,8 @@ class _Trainer:
         self.plausible = PlausibleView(
             craniotomy.centre_world_mm, craniotomy.outward_axis, ranges.tilt_max_deg, tuple(distance)
         )
-        index = case.manifest["stages"].get("synthesize", {})
-        identity = f"{preset.to_dict()} {seed} {views} {index.get('updated')} {ranges}"
+        appearances = files.sha256(folder_of(case, views.method) / "index.json")
+        identity = f"{preset.to_dict()} {seed} {views} {appearances} {ranges}"
         self.state = {
             "settings": {"sha256": hashlib.sha256(identity.encode()).hexdigest()},
             "step": 0,
