@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import zipfile
+from pathlib import Path
 
 import cases
 import cv2
@@ -214,8 +215,9 @@ def test_what_cannot_be_saved_is_refused_and_leaves_nothing(tmp_path, monkeypatc
     assert not out.exists()
 
 
-def test_saving_again_replaces_the_scene_and_leaves_no_other_file(tmp_path):
-    path = tmp_path / "scene.mrb"
+def test_saving_again_replaces_the_scene_and_leaves_no_other_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = Path("scene.mrb")  # as the demo gives it: relative, which Slicer itself refuses
     path.write_text("old")
     scene = scenes.new_scene()
     scenes.add_camera_transform(scene, np.eye(4))

@@ -19,6 +19,7 @@ from .views import ViewSettings
 
 QUEUE_BATCHES = 6
 TIMEOUT_S = 300.0
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,18 @@ class Feeder:
         )
 
     def __enter__(self) -> Feeder:
-        self._process.start()
+        # One thread each for numpy, OpenCV and Mesa's rasteriser: more would fight with training for its cores. They
+        # are read when the libraries load, so the new process must inherit them.
+        usual = {name: os.environ.get(name) for name in THREAD_LIMITS}
+        os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
+        try:
+            self._process.start()
+        finally:
+            for name, value in usual.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
         return self
 
     def __exit__(self, *_error) -> None:
@@ -101,7 +113,6 @@ def draw_views(case_folder: Path, settings: ViewSettings, count: int) -> Batch:
 
 def _serve(case_folder: str, settings: ViewSettings, batch: int, first_batch: int, out, parent: int) -> None:
     try:
-        os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's rasteriser: the other cores are for training
         import cv2
 
         from .views import ViewSource

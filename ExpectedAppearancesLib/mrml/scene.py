@@ -179,7 +179,7 @@ def set_outline(outline_node, silhouette: Silhouette, camera_from_world: np.ndar
 
 def write_bundle(scene, path: Path) -> None:
     """Save the scene with all its data as one .mrb, whole or not at all. Raises InputError when it cannot."""
-    path = Path(path)
+    path = Path(path).absolute()  # Slicer writes bundles to full paths only
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Under its final name in a folder of its own: Slicer names the scene inside the bundle after the file.
