@@ -1,4 +1,7 @@
 import itertools
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from ExpectedAppearancesLib.appearances.stage import synthesize_case
 from ExpectedAppearancesLib.appearances.synthesis import Job, Synthesizer
 from ExpectedAppearancesLib.appearances.vgg import load_vgg
 from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.masks.stage import render_case
 from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
@@ -240,3 +244,23 @@ def test_paper_preset_makes_every_pose_with_every_texture(case):
     synthesize_case(case, textures, lambda *_: None, "image", size_px=32, iterations=1, every_texture=True)
     _, appearances = store.read_appearances(case, "image")
     assert len(appearances) == 6 and {a.style for a in appearances} == {"a", "b"}
+
+
+def test_a_synthesis_killed_by_the_system_loses_no_finished_image(case, tmp_path):
+    for name in "abcdef":
+        files.write_png(tmp_path / "textures" / f"{name}.png", texture(name, size=96).image)
+    files.write_png(tmp_path / "textures" / "labels.png", texture(size=96).labels)
+    arguments = [str(case.folder), "--textures", str(tmp_path / "textures"), "--size", "48", "--iterations", "25"]
+    process = subprocess.Popen([sys.executable, "-m", "ExpectedAppearancesLib", "synthesize", *arguments])
+    folder = store.folder_of(case, "surface")
+    deadline = time.monotonic() + 120
+    while not (folder / "b-0.png").is_file() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    kept = {item["image"] for item in store.read_index(case, "surface")["items"]}
+    assert kept and not store.read_index(case, "surface")["done"]
+    stamps = {name: (folder / name).stat().st_mtime_ns for name in kept}
+    assert main(["synthesize", *arguments]) == 0
+    assert len(store.read_appearances(case, "surface")[1]) == 6
+    assert {name: (folder / name).stat().st_mtime_ns for name in kept} == stamps
