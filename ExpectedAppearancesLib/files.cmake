@@ -32,6 +32,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/demo/frames.py
   ExpectedAppearancesLib/demo/pipeline.py
   ExpectedAppearancesLib/demo/vessel_tree.py
+  ExpectedAppearancesLib/devices.py
   ExpectedAppearancesLib/errors.py
   ExpectedAppearancesLib/evaluation/__init__.py
   ExpectedAppearancesLib/evaluation/curves.py
@@ -50,7 +51,6 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/masks/stage.py
   ExpectedAppearancesLib/model/__init__.py
   ExpectedAppearancesLib/model/checkpoint.py
-  ExpectedAppearancesLib/model/devices.py
   ExpectedAppearancesLib/model/encoding.py
   ExpectedAppearancesLib/model/export.py
   ExpectedAppearancesLib/model/feeder.py

@@ -11,6 +11,7 @@ import torch
 
 from .. import files
 from ..case.case import Case
+from ..devices import choose_device, fast_dtype
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..masks.renderer import MaskRenderer
@@ -18,7 +19,7 @@ from ..masks.stage import craniotomy_of, parenchyma_of, read_rendered
 from ..textures.library import Texture
 from . import store
 from .overview import overview_view
-from .synthesis import Job, Synthesizer, fast_dtype
+from .synthesis import Job, Synthesizer
 from .vgg import SHIPPED_WEIGHTS, load_vgg
 
 
@@ -40,7 +41,7 @@ def synthesize_case(
     method `surface`: one overview per texture and seed. `image`: one image per rendered pose, textures taken in turn,
     or with `every_texture` each pose with each texture (the paper's 100 x 15).
     """
-    device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = device or choose_device("auto")
     vgg = load_vgg(weights_path, fast_dtype(device))
     weights_file = Path(weights_path) if weights_path else SHIPPED_WEIGHTS
     if method == "surface":
@@ -86,8 +87,7 @@ def synthesize_case(
             done[item["image"]] = item | {"gram_distance": round(distance, 5)}
         finished += len(part)
         store.write_index(case, method, camera, settings, list(done.values()), done=False)
-    names = {item["image"] for item in planned}
-    items = [item for name, item in done.items() if name in names]
+    items = [done[item["image"]] for item in planned]
     store.write_index(case, method, camera, settings, items, done=True)
     mean_distance = float(np.mean([item["gram_distance"] for item in items]))
     case.record("synthesize", done=True, **settings, gram_distance_mean=mean_distance)

@@ -27,14 +27,6 @@ class Job:
     seed: int
 
 
-def fast_dtype(device: torch.device) -> torch.dtype:
-    """bfloat16 where the processor multiplies it in hardware, else float32."""
-    if device.type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
-    supported = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    return torch.bfloat16 if supported else torch.float32
-
-
 class Synthesizer:
     """Makes images for jobs of one size; a texture's Grams are computed once and kept."""
 

@@ -82,34 +82,30 @@ class Case:
         part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
         shutil.rmtree(part, ignore_errors=True)  # of a killed run that had the same process id
         try:
-            part.mkdir(parents=True)
-            inputs = {}
-            for name, mesh in (("vessels", vessels), ("cortex", cortex)):
-                if mesh:
-                    write_vtp(part / f"{name}.vtp", mesh, space)
-                    inputs[name] = _input_entry(part / f"{name}.vtp", sources[name])
-            write_camera(part / "camera.json", camera)
-            inputs["camera"] = _input_entry(
-                part / "camera.json", None if isinstance(camera_path, Camera) else camera_path
-            )
-            manifest = {
-                "format": FORMAT,
-                "format_version": FORMAT_VERSION,
-                "created": _now(),
-                "versions": _versions(),
-                "space": space,
-                "inputs": inputs,
-                "stages": {},
-            }
-            files.write_json(part / MANIFEST_NAME, manifest)
-            if folder.exists():
-                folder.rmdir()  # empty, as checked; os.replace onto a folder fails on Windows
-            os.replace(part, folder)
-        except OSError as error:
-            raise InputError(
-                f"{folder}: cannot be written ({error.strerror or error}); "
-                "free some space or choose a folder you may write to."
-            ) from error
+            with files.writing(folder):
+                part.mkdir(parents=True)
+                inputs = {}
+                for name, mesh in (("vessels", vessels), ("cortex", cortex)):
+                    if mesh:
+                        write_vtp(part / f"{name}.vtp", mesh, space)
+                        inputs[name] = _input_entry(part / f"{name}.vtp", sources[name])
+                write_camera(part / "camera.json", camera)
+                inputs["camera"] = _input_entry(
+                    part / "camera.json", None if isinstance(camera_path, Camera) else camera_path
+                )
+                manifest = {
+                    "format": FORMAT,
+                    "format_version": FORMAT_VERSION,
+                    "created": _now(),
+                    "versions": _versions(),
+                    "space": space,
+                    "inputs": inputs,
+                    "stages": {},
+                }
+                files.write_json(part / MANIFEST_NAME, manifest)
+                if folder.exists():
+                    folder.rmdir()  # empty, as checked; os.replace onto a folder fails on Windows
+                os.replace(part, folder)
         except InputError as error:
             raise InputError(problem.replace(str(part), str(folder)) for problem in error.problems) from error
         finally:
@@ -203,9 +199,9 @@ def _check_view(vessels: Mesh, camera: Camera, vessels_path: Path, problems: Pro
 
 
 def _check_distance(vessels: Mesh, cortex: Mesh, vessels_path: Path, cortex_path: Path, problems: Problems) -> None:
-    if _gap_mm(vessels.vertices_mm, cortex.vertices_mm) <= LARGEST_GAP_MM:
-        return
     gap_mm = _gap_mm(vessels.vertices_mm, cortex.vertices_mm)
+    if gap_mm <= LARGEST_GAP_MM:
+        return
     flipped_gap_mm = _gap_mm(vessels.vertices_mm, cortex.vertices_mm * (-1.0, -1.0, 1.0))
     cause = (
         "one looks like LPS and the other like RAS, save both in the same space"

@@ -64,7 +64,7 @@ def run(args, progress) -> None:
     from ..appearances.contact_sheet import write_contact_sheet
     from ..appearances.stage import synthesize_case
     from ..appearances.vgg import download_vgg19
-    from ..model.devices import choose_device
+    from ..devices import choose_device
 
     paper = args.preset == "paper"
     method = "image" if paper else args.method

@@ -52,7 +52,7 @@ def run(args, progress) -> None:
             problems.add(f"--{name}: {value}; it must be above 0.")
     problems.raise_if_any()
 
-    from ..model.devices import choose_device
+    from ..devices import choose_device
     from ..model.presets import PRESETS
     from ..model.training import train_case
 

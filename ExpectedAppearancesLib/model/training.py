@@ -15,6 +15,7 @@ import torch
 from .. import files
 from ..appearances.store import folder_of, read_appearances
 from ..case.case import Case
+from ..devices import fast_dtype
 from ..evaluation.metrics import add_mm
 from ..masks.stage import craniotomy_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
@@ -117,7 +118,7 @@ class _Trainer:
         state, preset = self.state, self.preset
         begin = time.monotonic() - state["seconds"]
         saved = time.monotonic()
-        use_bfloat16 = self.device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+        use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
         with Feeder(self.case.folder, self.views, preset.fresh, first) as feeder:
@@ -131,9 +132,7 @@ class _Trainer:
                 for group in self.optimizer.param_groups:
                     group["lr"] = self._learning_rate(done)
                 self.network.train()
-                with torch.autocast(
-                    self.device.type, torch.bfloat16, enabled=use_bfloat16 and preset.estimator == "dense"
-                ):
+                with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16):
                     output = self.network(self._images(batch))
                 loss = self._loss(output, batch)
                 self.optimizer.zero_grad(set_to_none=True)

@@ -15,7 +15,7 @@ from .. import files
 from ..appearances.store import Appearance, read_appearances
 from ..augmentation import elastic, microscope
 from ..case.case import Case
-from ..geometry.pose import pose_from_rotation, transform
+from ..geometry.pose import pose_from_rotation, rotation_matrix, transform
 from ..masks.labels import BACKGROUND, VESSELS
 from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
@@ -77,19 +77,17 @@ class ViewSource:
     def view(self, index: int) -> View:
         rng = np.random.default_rng([self.settings.seed, 7, index])
         appearance = self._appearances[rng.integers(len(self._appearances))]
-        if self.settings.method == "surface":
+        on_surface = self.settings.method == "surface"
+        turn = np.eye(3)
+        if on_surface:
             pose = self._sampler.sample(index)
-            labels, _, points = self._renderer.render_surface(pose)
-            labels = self._without_bars(labels)
-            image = self._project(appearance, labels, points, rng)
         else:
-            turn = np.eye(3)
             if self.settings.fresh_poses:
                 turn = self._camera_turn(appearance.camera_from_world, rng)
             pose = pose_from_rotation(turn, np.zeros(3)) @ appearance.camera_from_world
-            labels, _, points = self._renderer.render_surface(pose)
-            labels = self._without_bars(labels)
-            image = self._turned(appearance, turn)
+        labels, _, points = self._renderer.render_surface(pose)
+        self._clear_bars(labels, 1)
+        image = self._project(appearance, labels, points, rng) if on_surface else self._turned(appearance, turn)
         image = self._fill_background(image, labels, rng)
         return self._finish(image, pose, labels, points, rng)
 
@@ -122,7 +120,7 @@ class ViewSource:
         for shrink in np.linspace(1.0, 0.0, 12):
             tilt = rng.uniform(-pan, pan, 2) * shrink
             roll = np.radians(rng.uniform(-1, 1) * min(ranges.roll_max_deg, 30.0)) * shrink
-            turn = cv2.Rodrigues(np.array([tilt[0], tilt[1], roll]))[0]
+            turn = rotation_matrix(np.array([tilt[0], tilt[1], roll]))
             turned = pose_from_rotation(turn, np.zeros(3)) @ camera_from_world
             if self._sampler.share_in_view(turned) >= ranges.in_view_min:
                 return turn
@@ -161,23 +159,17 @@ class ViewSource:
         if rng.uniform() < self.settings.negatives:
             small = _something_else(small, rng)
             surface, vessels = np.zeros_like(surface), np.zeros_like(vessels)
-        small = self._with_bars(small)
+        self._clear_bars(small, OVERSAMPLING)
         return View(small, pose, points, surface, vessels)
 
-    def _without_bars(self, labels: np.ndarray) -> np.ndarray:
-        """A frame that is not square leaves bars in the network's input, where nothing is seen."""
-        rows, columns = self._bars
-        labels[:rows], labels[len(labels) - rows :] = BACKGROUND, BACKGROUND
-        labels[:, :columns], labels[:, labels.shape[1] - columns :] = BACKGROUND, BACKGROUND
-        return labels
+    def _clear_bars(self, array: np.ndarray, reduction: int) -> None:
+        """Zero, in place, the bars that a frame that is not square leaves in the network's input.
 
-    def _with_bars(self, image: np.ndarray) -> np.ndarray:
-        rows, columns = (bar // OVERSAMPLING for bar in self._bars)
-        if rows or columns:
-            image = image.copy()
-            image[:rows], image[len(image) - rows :] = 0, 0
-            image[:, :columns], image[:, image.shape[1] - columns :] = 0, 0
-        return image
+        array: (H, W, ...), `reduction` times smaller than the composed view.
+        """
+        rows, columns = (bar // reduction for bar in self._bars)
+        array[:rows], array[len(array) - rows :] = 0, 0
+        array[:, :columns], array[:, array.shape[1] - columns :] = 0, 0
 
 
 def _lit(image: np.ndarray, points_mm: np.ndarray, labels: np.ndarray, rng) -> np.ndarray:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import files
 from ..case.case import Case
 from ..case.meshes import Mesh
 from ..errors import ExpectedAppearancesError, InputError
@@ -180,7 +181,7 @@ def set_outline(outline_node, silhouette: Silhouette, camera_from_world: np.ndar
 def write_bundle(scene, path: Path) -> None:
     """Save the scene with all its data as one .mrb, whole or not at all. Raises InputError when it cannot."""
     path = Path(path).absolute()  # Slicer writes bundles to full paths only
-    try:
+    with files.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         # Under its final name in a folder of its own: Slicer names the scene inside the bundle after the file.
         with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", suffix=".part", dir=path.parent) as folder:
@@ -190,11 +191,6 @@ def write_bundle(scene, path: Path) -> None:
                     f"{path}: Slicer could not save the scene; free some space, or choose a shorter path."
                 )
             os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); "
-            "free some space or choose a folder you may write to."
-        ) from error
 
 
 def _check_frame(image_rgb: np.ndarray, camera: Camera) -> None:

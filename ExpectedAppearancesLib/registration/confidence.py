@@ -10,6 +10,11 @@ GOOD_ADD_MM = 3.0
 PRECISION_WANTED = 0.99  # of accepted validation views, negatives among them
 
 
+def logistic(x: np.ndarray) -> np.ndarray:
+    """1 / (1 + exp(-x)), without overflow."""
+    return 1 / (1 + np.exp(-np.clip(x, -40, 40)))
+
+
 @dataclass(frozen=True)
 class Confidence:
     """Logistic model over standardised evidence: weights (F,), bias; evidence mean and scale (F,); threshold."""
@@ -26,7 +31,7 @@ class Confidence:
             return 0.0
         # Evidence far outside what validation showed must not push confidence beyond what was seen there.
         standard = np.clip((evidence - self.mean) / self.scale, -4, 4)
-        return float(1 / (1 + np.exp(-np.clip(standard @ self.weights + self.bias, -30, 30))))
+        return float(logistic(standard @ self.weights + self.bias))
 
     def to_dict(self) -> dict:
         return {key: np.asarray(value).tolist() for key, value in vars(self).items()}
@@ -47,14 +52,14 @@ def calibrate(evidence: np.ndarray, good: np.ndarray) -> Confidence:
     target = (good * (good.sum() + 1.0) + ~good * 1.0) / (np.where(good, good.sum(), (~good).sum()) + 2.0)
     beta = np.zeros(features + 1)
     for _ in range(50):
-        probability = 1 / (1 + np.exp(-np.clip(design @ beta, -30, 30)))
+        probability = logistic(design @ beta)
         gradient = design.T @ (probability - target) + penalty @ beta
         hessian = (design * (probability * (1 - probability))[:, None]).T @ design + penalty
         step = np.linalg.solve(hessian, gradient)
         beta -= step
         if np.abs(step).max() < 1e-8:
             break
-    probability = 1 / (1 + np.exp(-np.clip(design @ beta, -30, 30)))
+    probability = logistic(design @ beta)
     return Confidence(mean, scale, beta[:-1], float(beta[-1]), _threshold(probability, good))
 
 

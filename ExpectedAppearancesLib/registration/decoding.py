@@ -9,6 +9,7 @@ import numpy as np
 from ..geometry.camera import Camera
 from ..geometry.pose import inverse, transform
 from ..model.encoding import PoseEncoding
+from .confidence import logistic
 from .pnp import PoseFit, fit_pose
 
 EVIDENCE = {"dense": 8, "regression": 0}  # numbers of evidence that an estimator gives
@@ -64,7 +65,7 @@ def read_dense(output: np.ndarray, camera: Camera, encoding: PoseEncoding, seed:
     """output (6, G, G) of DenseSurfaceNet; camera: network camera of that frame."""
     grid = output.shape[-1]
     flat = output.reshape(6, -1).astype(np.float64)
-    surface = _sigmoid(flat[4])
+    surface = logistic(flat[4])
     used = surface > 0.5
     if used.sum() < LEAST_CELLS:
         return Reading(None, None)
@@ -73,7 +74,7 @@ def read_dense(output: np.ndarray, camera: Camera, encoding: PoseEncoding, seed:
     fit = fit_pose(points, cell_pixels(grid)[used], sigma_mm, camera, seed)
     if fit is None:
         return Reading(None, None)
-    vessel = _sigmoid(flat[5, used])
+    vessel = logistic(flat[5, used])
     evidence = np.array(
         [
             np.log(fit.expected_add_mm(encoding.scale_mm) + 1e-4),
@@ -92,7 +93,3 @@ def read_dense(output: np.ndarray, camera: Camera, encoding: PoseEncoding, seed:
 def read_regression(output: np.ndarray, encoding: PoseEncoding) -> Reading:
     """output (6,) of PaperRegressor: a pose, and nothing that tells whether to believe it."""
     return Reading(encoding.decode(output), np.zeros(0))
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-np.clip(x, -40, 40)))
