@@ -7,13 +7,16 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/appearances/gram.py
   ExpectedAppearancesLib/appearances/lbfgs.py
   ExpectedAppearancesLib/appearances/overview.py
+  ExpectedAppearancesLib/appearances/projection.py
   ExpectedAppearancesLib/appearances/stage.py
   ExpectedAppearancesLib/appearances/store.py
   ExpectedAppearancesLib/appearances/synthesis.py
   ExpectedAppearancesLib/appearances/vgg.py
   ExpectedAppearancesLib/augmentation/__init__.py
   ExpectedAppearancesLib/augmentation/elastic.py
+  ExpectedAppearancesLib/augmentation/impostors.py
   ExpectedAppearancesLib/augmentation/microscope.py
+  ExpectedAppearancesLib/augmentation/surroundings.py
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py

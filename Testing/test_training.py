@@ -8,7 +8,7 @@ import torch
 from cases import camera, write_inputs
 
 from ExpectedAppearancesLib import files
-from ExpectedAppearancesLib.appearances import store
+from ExpectedAppearancesLib.appearances import projection, store
 from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
@@ -62,6 +62,14 @@ def settings(method: str, **changes) -> views.ViewSettings:
     return replace(views.ViewSettings(method, 64, ("a", "b"), True, 0.0, 0.0, seed=5), **changes)
 
 
+def show_plainly(monkeypatch) -> None:
+    """Views without light, lens, or anything around the surface."""
+    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
+    monkeypatch.setattr(views, "opening", lambda *_: None)
+    monkeypatch.setattr(projection.SurfacePainter, "_lit", lambda _self, image, *_: image)
+    monkeypatch.setattr(projection, "DEPTH_OF_FIELD", 0.0)
+
+
 def agreement(view: views.View) -> float:
     """Intersection over union of the cells that look like vessels and those said to be."""
     cells = view.image.reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
@@ -72,8 +80,7 @@ def agreement(view: views.View) -> float:
 @pytest.mark.parametrize("method", ["surface", "image"])
 def test_views_show_at_each_cell_what_they_say(case, method, monkeypatch):
     """Points project onto their cells; colours and vessel cells agree, so image and geometry come from one pose."""
-    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
-    monkeypatch.setattr(views, "_lit", lambda image, *_: image)
+    show_plainly(monkeypatch)
     source = views.ViewSource(case.folder, settings(method))
     agreeing = []
     for index in range(6):
@@ -108,8 +115,7 @@ def test_negative_views_have_no_surface(case):
 
 
 def test_elastic_deformation_takes_the_points_along(case, monkeypatch):
-    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
-    monkeypatch.setattr(views, "_lit", lambda image, *_: image)
+    show_plainly(monkeypatch)
     straight = views.ViewSource(case.folder, settings("surface"))
     bent = views.ViewSource(case.folder, settings("surface", elastic_px=6.0))
     pairs = [(straight.view(i), bent.view(i)) for i in range(6)]

@@ -45,33 +45,34 @@ class DenseSurfaceNet(nn.Module):
 
     -> (B, 6, S/2, S/2): surface coordinates in units of the case's scale (3), log of their scale of error (1),
     logit of "the case's surface is here" (1), logit of "vessel" (1).
+    What comes up is added to what was kept, not concatenated, and no layer works at the input's own size: on a CPU
+    these two would cost more than everything else together.
     """
 
     def __init__(self, width: float = 1.0):
         super().__init__()
-        c = [8 * round(width * n / 8) for n in (24, 48, 96, 160, 224)]
-        self.stem = _block(3, c[0])
-        self.down1 = nn.Sequential(_block(c[0], c[1], 2), _block(c[1], c[1]))
-        self.down2 = nn.Sequential(_block(c[1], c[2], 2), _block(c[2], c[2]))
-        self.down3 = nn.Sequential(_block(c[2], c[3], 2), _block(c[3], c[3]))
-        self.down4 = nn.Sequential(_block(c[3], c[4], 2), _block(c[4], c[4]))
-        self.context = nn.Linear(c[4], c[4])
-        self.bottom = _block(c[4], c[4])
-        self.up3 = _block(c[4] + c[3], c[3])
-        self.up2 = _block(c[3] + c[2], c[2])
-        self.up1 = nn.Sequential(_block(c[2] + c[1], c[1]), _block(c[1], c[1]))
-        self.head = nn.Conv2d(c[1], 6, 1)
+        c = [16 * round(width * n / 16) for n in (48, 96, 160, 224)]
+        self.stem = nn.Sequential(nn.PixelUnshuffle(2), _block(12, c[0]), _block(c[0], c[0]))
+        self.down2 = nn.Sequential(_block(c[0], c[1], 2), _block(c[1], c[1]))
+        self.down3 = nn.Sequential(_block(c[1], c[2], 2), _block(c[2], c[2]))
+        self.down4 = nn.Sequential(_block(c[2], c[3], 2), _block(c[3], c[3]))
+        self.context = nn.Linear(c[3], c[3])
+        self.bottom = _block(c[3], c[3])
+        self.narrow3, self.up3 = nn.Conv2d(c[3], c[2], 1), _block(c[2], c[2])
+        self.narrow2, self.up2 = nn.Conv2d(c[2], c[1], 1), _block(c[1], c[1])
+        self.narrow1, self.up1 = nn.Conv2d(c[1], c[0], 1), _block(c[0], c[0])
+        self.head = nn.Conv2d(c[0], 6, 1)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        x1 = self.down1(self.stem(image - 0.5))
+        x1 = self.stem(image - 0.5)
         x2 = self.down2(x1)
         x3 = self.down3(x2)
         x4 = self.down4(x3)
         # What lies where depends on the whole view: its mean is given to every cell.
         x4 = self.bottom(x4 + self.context(x4.mean(dim=(2, 3)))[:, :, None, None])
-        x = self.up3(torch.cat([_twice(x4), x3], dim=1))
-        x = self.up2(torch.cat([_twice(x), x2], dim=1))
-        x = self.up1(torch.cat([_twice(x), x1], dim=1))
+        x = self.up3(_twice(self.narrow3(x4)) + x3)
+        x = self.up2(_twice(self.narrow2(x)) + x2)
+        x = self.up1(_twice(self.narrow1(x)) + x1)
         return self.head(x).float()
 
 

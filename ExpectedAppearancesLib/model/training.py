@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -90,7 +91,9 @@ class _Trainer:
         torch.manual_seed(seed)
         network = build_network(preset.estimator, preset.size_px, preset.width).to(device)
         self.network = network.to(memory_format=torch.channels_last)
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=preset.learning_rate, weight_decay=1e-4)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=preset.learning_rate, weight_decay=1e-4, fused=True
+        )
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.best = self.average
         craniotomy = craniotomy_of(case)
@@ -118,6 +121,9 @@ class _Trainer:
         state, preset = self.state, self.preset
         begin = time.monotonic() - state["seconds"]
         saved = time.monotonic()
+        if self.device.type == "cpu":
+            # The feeder has a core of its own: threads that wait for each other on one core cost more than they give.
+            torch.set_num_threads(max(1, (os.cpu_count() or 2) - 1))
         use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
@@ -220,11 +226,11 @@ class _Trainer:
     @torch.no_grad()
     def _update_average(self, step: int) -> None:
         decay = min(AVERAGE_DECAY, (1 + step) / (10 + step))
-        for key, value in self.network.state_dict().items():
-            if value.is_floating_point():
-                self.average[key].lerp_(value, 1 - decay)
-            else:
-                self.average[key].copy_(value)
+        values = self.network.state_dict()
+        floating = [key for key, value in values.items() if value.is_floating_point()]
+        torch._foreach_lerp_([self.average[key] for key in floating], [values[key] for key in floating], 1 - decay)
+        for key in values.keys() - set(floating):
+            self.average[key].copy_(values[key])
 
     @torch.no_grad()
     def _validate(self, validation: Batch, recent: list[float]) -> None:
