@@ -18,6 +18,7 @@ from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.masks.stage import craniotomy_of, parenchyma_of, read_rendered, render_case
 from ExpectedAppearancesLib.model import views
 from ExpectedAppearancesLib.model.encoding import fit_encoding, network_camera
+from ExpectedAppearancesLib.model.feeder import Feeder, draw_views
 from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
 from ExpectedAppearancesLib.model.networks import build_network
 from ExpectedAppearancesLib.model.presets import PRESETS
@@ -105,6 +106,17 @@ def test_views_depend_only_on_seed_and_index_and_have_poses_of_their_own(case):
     paper = views.ViewSource(case.folder, settings("image", fresh_poses=False))
     stored = [frame["camera_from_world"] for frame in read_rendered(case)]
     assert all(min(np.abs(paper.view(i).camera_from_world - p).max() for p in stored) < 1e-12 for i in range(5))
+
+
+def test_processes_that_draw_in_turn_draw_what_one_draws(case):
+    drawn = []
+    for workers in (1, 3):
+        with Feeder(case.folder, settings("surface"), 2, first_batch=1, workers=workers) as feeder:
+            drawn.append([feeder.next().images for _ in range(4)])
+    np.testing.assert_array_equal(*drawn)
+    source = views.ViewSource(case.folder, settings("surface"))
+    np.testing.assert_array_equal(drawn[0][1][1], source.view(5).image)
+    np.testing.assert_array_equal(draw_views(case.folder, settings("surface"), 18).images[17], source.view(17).image)
 
 
 def test_negative_views_have_no_surface(case):

@@ -62,13 +62,13 @@ def train_case(
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
     trainer = _Trainer(case, preset, encoding, device, seed, views)
     progress(0.0, "rendering validation views")
-    validation = draw_views(case.folder, validation_views, preset.validation_views)
+    workers = max(1, (os.cpu_count() or 2) - 1)
+    validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
     case.record("train", preset=preset.to_dict(), seed=seed, styles=trained_on, held_out_styles=held_out, done=False)
     trainer.run(validation, progress)
     progress(1.0, "calibrating confidence")
-    calibration = draw_views(
-        case.folder, replace(validation_views, negatives=0.3, seed=seed + 2001), 2 * preset.validation_views
-    )
+    calibration_views = replace(validation_views, negatives=0.3, seed=seed + 2001)
+    calibration = draw_views(case.folder, calibration_views, 4 * preset.validation_views, workers)
     figures = trainer.export(calibration, validation)
     case.record(
         "train",
@@ -78,6 +78,12 @@ def train_case(
         model_sha256=files.sha256(case.model_folder / "model.onnx"),
     )
     return figures
+
+
+def _feeder_workers(device: torch.device) -> int:
+    """Processes that render: on a CPU they share the cores with training, beside a GPU they have all but two."""
+    cores = os.cpu_count() or 2
+    return max(1, cores - 2) if device.type == "cuda" else max(1, cores // 3)
 
 
 class _Trainer:
@@ -122,12 +128,12 @@ class _Trainer:
         begin = time.monotonic() - state["seconds"]
         saved = time.monotonic()
         if self.device.type == "cpu":
-            # The feeder has a core of its own: threads that wait for each other on one core cost more than they give.
-            torch.set_num_threads(max(1, (os.cpu_count() or 2) - 1))
+            # Rendering has cores of its own: threads that wait for each other on one core cost more than they give.
+            torch.set_num_threads(max(1, (os.cpu_count() or 2) - _feeder_workers(self.device)))
         use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
-        with Feeder(self.case.folder, self.views, preset.fresh, first) as feeder:
+        with Feeder(self.case.folder, self.views, preset.fresh, first, _feeder_workers(self.device)) as feeder:
             memory = ViewMemory(feeder, preset.batch, preset.remembered, self.views.seed)
             while True:
                 done = max(state["step"] / preset.steps, state["seconds"] / 60 / preset.minutes)
