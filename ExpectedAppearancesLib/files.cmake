@@ -49,6 +49,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/geometry/pose.py
   ExpectedAppearancesLib/geometry/silhouette.py
   ExpectedAppearancesLib/masks/__init__.py
+  ExpectedAppearancesLib/masks/exposed.py
   ExpectedAppearancesLib/masks/labels.py
   ExpectedAppearancesLib/masks/renderer.py
   ExpectedAppearancesLib/masks/stage.py
@@ -74,6 +75,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/registration/poses_file.py
   ExpectedAppearancesLib/registration/predictor.py
   ExpectedAppearancesLib/registration/record.py
+  ExpectedAppearancesLib/registration/refinement.py
   ExpectedAppearancesLib/textures/__init__.py
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py

@@ -16,11 +16,15 @@ import torch
 from .. import files
 from ..appearances.store import folder_of, read_appearances
 from ..case.case import Case
+from ..case.meshes import write_vtp
 from ..devices import fast_dtype
 from ..evaluation.metrics import add_mm
-from ..masks.stage import craniotomy_of, sampler_of
+from ..masks.exposed import exposed_vessels
+from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
 from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
+from ..registration.predictor import EXPOSED_VESSELS_NAME
+from ..registration.refinement import VesselAligner
 from . import checkpoint
 from .encoding import PoseEncoding, fit_encoding, network_camera
 from .export import export_model
@@ -103,6 +107,8 @@ class _Trainer:
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.best = self.average
         craniotomy = craniotomy_of(case)
+        self.exposed = exposed_vessels(case.vessels, parenchyma_of(case, craniotomy), craniotomy.outward_axis)
+        self.aligner = VesselAligner(self.exposed.vertices_mm, self.exposed.triangles, self.camera)
         ranges = sampler_of(case, 0).ranges
         distance = ranges.working_distance_mm
         self.plausible = PlausibleView(
@@ -207,6 +213,7 @@ class _Trainer:
         files.write_json(
             self.case.model_folder / "training.json", {"curve": self.state["curve"], "validation": figures}
         )
+        write_vtp(self.case.model_folder / EXPOSED_VESSELS_NAME, self.exposed)
         export_model(self.network.cpu(), self.preset, meta, self.case.model_folder)
         return figures
 
@@ -258,7 +265,7 @@ class _Trainer:
         outputs = np.concatenate([self.network(images[i : i + 32]).cpu().numpy() for i in range(0, len(images), 32)])
         if self.preset.estimator == "regression":
             return [read_regression(output, self.encoding) for output in outputs]
-        return [read_dense(output, self.camera, self.encoding) for output in outputs]
+        return [read_dense(output, self.camera, self.encoding, self.aligner) for output in outputs]
 
     def _add(self, readings: list[Reading], batch: Batch) -> np.ndarray:
         vertices = self.case.vessels.vertices_mm[::20]
