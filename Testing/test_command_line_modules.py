@@ -9,7 +9,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
@@ -247,7 +246,7 @@ def test_only_one_run_of_a_kind_works_on_a_case(rendered):
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_terminated_by_slicer_or_killed_it_can_be_resumed(rendered):
     """SIGTERM ends it with 3; SIGKILL, which Slicer's Cancel sends, ends it at once; the next start goes on."""
-    arguments = [str(rendered.folder), "--size", "96", "--iterations", "40", "--method", "image"]
+    arguments = [str(rendered.folder), "--size", "48", "--iterations", "8", "--preset", "paper"]
     command = [sys.executable, str(script_of("synthesize")), *arguments]
     folder = store.folder_of(rendered, "image")
     kept: set[str] = set()
@@ -263,7 +262,7 @@ def test_terminated_by_slicer_or_killed_it_can_be_resumed(rendered):
         index = files.read_json(folder / "index.json", "index")
         made = {item["image"] for item in index["items"]}
         assert not index["done"] and kept < made
-        assert all(files.read_image_rgb(folder / name).shape == (96, 96, 3) for name in made)
+        assert all(files.read_image_rgb(folder / name).shape == (48, 48, 3) for name in made)
         kept = made
 
 
@@ -276,10 +275,9 @@ def test_training_tells_its_losses(rendered, monkeypatch, capsys):
         if not (folder / item["image"]).is_file():  # the test above removed one
             files.write_png(folder / item["image"], files.read_image_rgb(next(folder.glob("*-0.png"))))
     monkeypatch.setitem(presets.PRESETS, "quick", TINY)
-    begin = time.monotonic()
     code = command_line_module.main("train", as_slicer_passes("train", {"case": str(rendered.folder), "device": "cpu"}))
     told = [f for f in figures(capsys.readouterr().out) if "step" in f]
-    assert code == 0, time.monotonic() - begin
+    assert code == 0
     assert [f["step"] for f in told] == [10, 20]
     assert all(isinstance(f["loss"], float) for f in told) and told[1]["validation_add_mm"] > 0
     assert result_problem("train", rendered.folder, thorough=True) == ""
@@ -295,7 +293,7 @@ def test_a_long_run_reports_less_often(capsys):
     progress = SlicerProgress("train", None)
     progress._clock = lambda: now_s
     progress._created_s = 0.0
-    for now_s in range(12 * 3600):
+    for now_s in range(0, 12 * 3600, 2):
         progress(now_s / 1e6, f"step {now_s}, loss -0.5")
     text = capsys.readouterr().out
     assert 5_000 < text.count("<filter-progress>") < 12_000 and len(text) < 3e6

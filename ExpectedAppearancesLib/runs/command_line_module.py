@@ -58,11 +58,11 @@ def command_arguments(command: str, arguments: Sequence[str]) -> list[str]:
             rest.append(flag)
             continue
         values = [value] if "=" in arguments[i - 1] else []
-        several = action.nargs in ("+", "*")
-        while i < len(arguments) and arguments[i] not in options and (several or not values):
+        most = 0 if values else len(arguments) if action.nargs in ("+", "*") else 1
+        while i < len(arguments) and len(values) < most and not arguments[i].startswith("--"):
             values.append(arguments[i])
             i += 1
-        if several:
+        if action.nargs in ("+", "*"):
             # slicer.cli.run makes "'a', 'b'" of the list ["a", "b"].
             values = [part.strip(" '\"") for text in values for part in text.split(",")]
         values = [value for value in values if not _left_out(action, value)]
