@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.machinery
 import subprocess
 import sys
+import time
 import types
 import zipfile
 from importlib import metadata
@@ -18,7 +19,7 @@ from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.runs import dependencies
 from ExpectedAppearancesLib.runs.dependencies import InstallError, Package
 from ExpectedAppearancesLib.runs.pip_words import explanation
-from ExpectedAppearancesLib.runs.system_report import system_report
+from ExpectedAppearancesLib.runs.system_report import SystemCheck
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "expected-appearances-test-package"
@@ -244,9 +245,21 @@ def test_torch_comes_through_its_extension_except_from_a_folder(slicer, monkeypa
 
 def test_report_for_a_mail_holds_what_check_says_and_slicers_version(slicer, monkeypatch):
     monkeypatch.setattr(check, "_run_python", lambda _source: (0, "[]", ""))
-    report = system_report()
+    report = dependencies.system_report()
     monkeypatch.undo()
     assert report.startswith("3D Slicer 5.8.1 (revision 33241, linux-amd64)")
     assert f"Package numpy: {metadata.version('numpy')}" in report
     for purpose in ("registering frames", "planning", "synthesis and training"):
         assert f"For {purpose}: " in report
+
+
+def test_the_computer_is_checked_without_waiting():
+    begin = time.thread_time()
+    query = SystemCheck()
+    assert query.poll() is None and time.thread_time() - begin < 0.1
+    deadline = time.monotonic() + 120
+    while query.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    report = query.poll()
+    assert report["packages"]["numpy"] == metadata.version("numpy") and isinstance(report["devices"], list)
+    assert query.poll() is report

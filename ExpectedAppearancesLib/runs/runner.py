@@ -20,7 +20,7 @@ from .state import RunState, RunStatus
 
 CANCEL_DEADLINE_S = 10.0  # after which the processes are no longer asked to end
 SWEEP_DEADLINE_S = 5.0
-START_LOCK_S = 5.0
+START_LOCK_S = 1.0
 TAIL_LINES = 8
 NEEDED_PACKAGES = ("psutil", "filelock")
 KEPT = "What was finished is kept; the next start goes on from there."
@@ -40,9 +40,16 @@ class Run:
         self._final: RunStatus | None = None
 
     @staticmethod
-    def start(kind: str, case_folder: Path, arguments: list[str], python: str | None = None) -> Run:
+    def start(
+        kind: str,
+        case_folder: Path,
+        arguments: list[str],
+        python: str | None = None,
+        environment: dict[str, str] | None = None,
+    ) -> Run:
         """Start `kind` ("synthesize", "train", or another command) on the case with the command's own options.
 
+        environment: variables to set beside this process's own, such as CUDA_VISIBLE_DEVICES to choose a GPU.
         Raises InputError: no case, a run of this kind is going on in it, or it cannot be started.
         """
         missing = [name for name in NEEDED_PACKAGES if importlib.util.find_spec(name) is None]
@@ -60,12 +67,14 @@ class Run:
                         f"{folder}: a run of '{kind}' is going on in this case (process {previous.pid}, since "
                         f"{previous.started}); wait until it has ended, or cancel it."
                     )
+                if not previous.outcome:
+                    _tree_of(previous).kill()  # orphans of a crash that nobody has seen
                 remove_partial_files(folder, [previous.pid])
             log = _new_log(folder, kind)
             mark = uuid.uuid4().hex
             command = command_of(kind, folder, [str(argument) for argument in arguments], python)
             try:
-                tree = processes.start(command, environment_of(mark), folder / log)
+                tree = processes.start(command, environment_of(mark) | (environment or {}), folder / log)
             except OSError as error:
                 raise InputError(
                     f"{python}: cannot be started ({error.strerror or error}); repair this Python."
