@@ -113,9 +113,11 @@ class Run:
         if self._final is not None:
             return self._final
         if self._tree.running():
-            if self._cancel_deadline is not None and time.monotonic() > self._cancel_deadline:
-                self._tree.kill()
             self._output.read()
+            if self._cancel_deadline is not None:
+                # After its last words an interpreter may still tidy up for seconds.
+                if self._output.exit_code is not None or time.monotonic() > self._cancel_deadline:
+                    self._tree.kill()
             return self._status(self._active_state())
         if self._sweep_deadline is None:
             self._sweep_deadline = time.monotonic() + SWEEP_DEADLINE_S
@@ -177,7 +179,7 @@ class Run:
 
     def _judged(self) -> RunStatus:
         code = self._tree.exit_code()
-        if code is None:
+        if code is None or (self._record.cancelled and self._output.exit_code is not None):
             code = self._output.exit_code
         unfinished = result_problem(self.kind, self.case_folder) if code == EXIT_DONE else ""
         if code == EXIT_DONE and not unfinished:
