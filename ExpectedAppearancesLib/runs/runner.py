@@ -114,10 +114,10 @@ class Run:
             return self._final
         if self._tree.running():
             self._output.read()
-            if self._cancel_deadline is not None:
-                # After its last words an interpreter may still tidy up for seconds.
-                if self._output.exit_code is not None or time.monotonic() > self._cancel_deadline:
-                    self._tree.kill()
+            # After its last words an interpreter may still tidy up for seconds.
+            said_all = self._output.exit_code is not None
+            if self._cancel_deadline is not None and (said_all or time.monotonic() > self._cancel_deadline):
+                self._tree.kill()
             return self._status(self._active_state())
         if self._sweep_deadline is None:
             self._sweep_deadline = time.monotonic() + SWEEP_DEADLINE_S
