@@ -165,6 +165,11 @@ def test_lists_are_taken_from_a_shell_and_from_slicer(arguments):
     assert (args.case, args.exclude, args.size) == ("/c", ["a", "b"], 64)
 
 
+def test_a_command_that_is_no_module_of_slicer_gets_its_options_as_they_are():
+    arguments = ["/c", "--poses", "5", "--seed", "0", "--bogus", "0", "-1.5", "auto"]
+    assert command_arguments("render", arguments) == arguments
+
+
 def test_what_is_wrong_still_reaches_the_command():
     assert command_arguments("train", ["/c", "--steps", "-3", "--bogus"]) == ["/c", "--bogus", "--steps", "-3"]
     assert command_arguments("synthesize", ["/c", "--seeds", "0"]) == ["/c", "--seeds", "0"]  # no default stands for it

@@ -242,10 +242,10 @@ if action == "start":
     Run.start("synthesize", case, [sys.argv[4]]).detach()
 else:
     run = Run.find(case, "synthesize")
-    if run is not None and action == "cancel":
+    if run is not None and action in ("cancel", "ask"):
         run.poll()
         run.cancel()
-    status = None if run is None else run.wait(60) if action != "look" else run.poll()
+    status = None if run is None else run.poll() if action in ("look", "ask") else run.wait(60)
     if status is not None:
         print(json.dumps([status.state.value, status.fraction, status.exit_code, status.problem]))
 """
@@ -285,6 +285,16 @@ def test_a_later_process_learns_once_that_a_run_has_crashed(case):
     state, _, code, problem = elsewhere(case, "wait")
     assert (state, code) == ("failed", None) and "without a word" in problem and "about to crash" in problem
     assert elsewhere(case, "wait") is None
+
+
+def test_a_cancel_whose_program_was_closed_is_carried_out_by_the_next_one(case, monkeypatch):
+    monkeypatch.setattr(runner, "CANCEL_DEADLINE_S", 1.0)
+    elsewhere(case, "start", "stubborn")
+    wait_until_ready(case)
+    elsewhere(case, "ask")
+    run = Run.find(case, "synthesize")
+    assert run.poll().state is RunState.CANCELLING
+    assert run.wait(DEADLINE_S).state is RunState.CANCELLED and members(run) == []
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")

@@ -35,7 +35,8 @@ class Run:
         self._record = record
         self._tree = processes.ProcessTree(record.pid, record.created_s, record.mark)
         self._output = OutputReader(self.case_folder / record.log, from_the_end)
-        self._cancel_deadline: float | None = None
+        # One that an earlier program began to cancel, and did not live to see the end of, is ended here.
+        self._cancel_deadline = time.monotonic() + CANCEL_DEADLINE_S if record.cancelled else None
         self._sweep_deadline: float | None = None
         self._final: RunStatus | None = None
 
