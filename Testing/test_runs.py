@@ -287,6 +287,7 @@ def test_a_later_process_learns_once_that_a_run_has_crashed(case):
     assert elsewhere(case, "wait") is None
 
 
+@pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_a_cancel_whose_program_was_closed_is_carried_out_by_the_next_one(case, monkeypatch):
     monkeypatch.setattr(runner, "CANCEL_DEADLINE_S", 1.0)
     elsewhere(case, "start", "stubborn")
