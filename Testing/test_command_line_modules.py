@@ -31,6 +31,7 @@ from ExpectedAppearancesLib.runs.state import RunState
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAD = ("category", "title", "description", "version", "documentation-url", "license", "contributor")
+RIVALS = {"probseg", "binseg"}  # presets that are trained to be compared with, not to be used
 SCALARS = {"integer": int, "double": float}
 TINY = replace(
     presets.PRESETS["quick"], size_px=64, steps=20, batch=4, fresh=4, validation_views=4, validate_every=10, width=0.4
@@ -49,7 +50,9 @@ def parameters(command: str) -> dict[str, ElementTree.Element]:
 
 
 def actions(command: str) -> dict[str, argparse.Action]:
-    return {a.dest: a for a in parser_of(command)._actions if not isinstance(a, argparse._HelpAction)}
+    """What the panel offers: all but the options in groups of their own, which serve studies."""
+    usual = [a for group in parser_of(command)._action_groups[:2] for a in group._group_actions]
+    return {a.dest: a for a in usual if not isinstance(a, argparse._HelpAction)}
 
 
 def as_slicer_passes(command: str, chosen: dict[str, str], widgets: bool = True) -> list[str]:
@@ -112,8 +115,11 @@ def test_description_and_command_agree(command):
         if action.choices:
             assert parameter.tag == "string-enumeration", name
             assert default in elements
-            assert elements == (["auto"] if action.default is None else []) + list(action.choices), name
+            offered = [choice for choice in action.choices if choice not in RIVALS]
+            assert elements == (["auto"] if action.default is None else []) + offered, name
             assert default == (action.default or "auto"), name
+        elif action.nargs == 0:
+            assert (parameter.tag, default) == ("boolean", "false"), name
         elif action.type in (int, float):
             assert SCALARS.get(parameter.tag) is action.type, name
             assert action.type(default) == (action.default or 0), name
