@@ -240,6 +240,10 @@ runner.command_of = lambda _kind, case, arguments, python: [python, sys.argv[2],
 case, action = sys.argv[1], sys.argv[3]
 if action == "start":
     Run.start("synthesize", case, [sys.argv[4]]).detach()
+elif action == "hold":
+    run = Run.start("synthesize", case, [sys.argv[4]])
+    while True:
+        run.wait(60)
 else:
     run = Run.find(case, "synthesize")
     if run is not None and action in ("cancel", "ask"):
@@ -251,11 +255,15 @@ else:
 """
 
 
+def other_command(case, *arguments) -> list[str]:
+    return [sys.executable, "-c", OTHER, str(case), str(case.parent / "child.py"), *arguments]
+
+
 def elsewhere(case, *arguments):
     """Do it in another process: the Slicer that is started later."""
     environment = environment_of("") | {"PYTHONPATH": str(LIBRARY_PARENT)}
     done = subprocess.run(
-        [sys.executable, "-c", OTHER, str(case), str(case.parent / "child.py"), *arguments],
+        other_command(case, *arguments),
         capture_output=True,
         text=True,
         encoding="utf-8",
@@ -278,6 +286,20 @@ def test_a_later_process_finds_a_run_and_can_cancel_it(case):
     assert elsewhere(case, "cancel")[0] == "cancelled"
     assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in tree)
     assert elsewhere(case, "look") is None
+
+
+def test_a_run_goes_on_when_the_program_that_started_it_is_killed(case):
+    environment = environment_of("") | {"PYTHONPATH": str(LIBRARY_PARENT)}
+    program = subprocess.Popen(other_command(case, "hold", "wait"), env=environment)
+    wait_until_ready(case)
+    program.kill()
+    program.wait()
+    run = Run.find(case, "synthesize")
+    tree = wait_for_three(run)
+    time.sleep(0.5)
+    assert run.poll().state is RunState.RUNNING and all(p.is_running() for p in tree)
+    run.cancel()
+    assert run.wait(DEADLINE_S).state is RunState.CANCELLED
 
 
 def test_a_later_process_learns_once_that_a_run_has_crashed(case):
