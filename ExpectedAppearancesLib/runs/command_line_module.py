@@ -146,6 +146,10 @@ class SlicerProgress(Progress):
 def main(command: str, arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code: 0 done, 2 bad input, 3 cancelled, 1 anything else."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        # Slicer and the runner read UTF-8; a path in another alphabet must not end the run.
+        with contextlib.suppress(AttributeError):
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
     progress = SlicerProgress(command, None)
     code = EXIT_FAILED
     try:

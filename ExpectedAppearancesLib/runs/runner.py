@@ -129,7 +129,9 @@ class Run:
             self._tree.kill()
             if time.monotonic() < self._sweep_deadline:
                 return self._status(self._active_state())
-        remove_partial_files(self.case_folder, {self._record.pid, self._output.figures.get("pid", self._record.pid)})
+        told = self._output.figures.get("pid")  # another one where a launcher stands between
+        pids = {self._record.pid} | ({told} if isinstance(told, int) else set())
+        remove_partial_files(self.case_folder, pids)
         self._final = self._judged()
         self._record = update_record(self.case_folder, self._record, outcome=self._final.state.value)
         return self._final
