@@ -19,12 +19,15 @@ ITERATIONS = 12
 @dataclass(frozen=True)
 class PoseFit:
     """camera_from_world (4, 4); covariance (6, 6) of (rotation vector in the camera frame about the points' centre,
-    rad; translation, mm), as if all residuals were independent; inlier_share; residual: mean of |residual| / sigma."""
+    rad; translation, mm), as if all residuals were independent; inlier_share; residual: mean of |residual| / sigma;
+    centre_world_mm (3,): the points' centre; residuals: how many points have weight."""
 
     camera_from_world: np.ndarray
     covariance: np.ndarray
     inlier_share: float
     residual: float
+    centre_world_mm: np.ndarray
+    residuals: int
 
     def expected_add_mm(self, radius_mm: float) -> float:
         """Root mean square displacement of points at `radius_mm` around the centre that the covariance stands for."""
@@ -109,4 +112,5 @@ def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_p
         return None
     inlier_share = float((distance < threshold_px).mean())
     pose = pose_from_rotation(rotation, position - rotation @ centre)
-    return PoseFit(pose, np.linalg.inv(information), inlier_share, float(np.minimum(scaled, 10).mean()))
+    mean_residual = float(np.minimum(scaled, 10).mean())
+    return PoseFit(pose, np.linalg.inv(information), inlier_share, mean_residual, centre, int((weight > 0).sum()))

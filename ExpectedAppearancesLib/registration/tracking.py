@@ -1,5 +1,7 @@
-"""Poses of a video, filtered: constant-velocity error-state Kalman filter on SE(3), after J. Sola, Quaternion kinematics
-for the error-state Kalman filter (2017), and T. Barfoot, State Estimation for Robotics (2017). Numpy and scipy only.
+"""Poses of a video, filtered: constant-velocity error-state Kalman filter on SE(3). Numpy and scipy only.
+
+After J. Sola, Quaternion kinematics for the error-state Kalman filter (2017), and T. Barfoot, State Estimation for
+Robotics (2017).
 
 The state is the pose and its twist per second, about the case's centre: a microscope that orbits its focus then keeps
 its twist, and rotation and translation of the error are all but independent.
@@ -39,7 +41,8 @@ class TrackerSettings:
     where a track begins. gate_share: share of right poses that the gate lets through (chi-square, 6 degrees of
     freedom). lost_after_s: without a frame that was used. lost_sigma_mm, lost_sigma_deg: standard deviation, in the
     worst direction, from which the pose says nothing. agreeing_frames: accepted frames, within lost_after_s, that must
-    lie on one motion before a track begins.
+    lie on one motion before a track begins. lasting_share: share of a frame's covariance that no averaging over time
+    takes away, since a network errs in much the same way in the next frame.
     """
 
     centre_world_mm: np.ndarray
@@ -52,6 +55,7 @@ class TrackerSettings:
     lost_sigma_mm: float = 10.0
     lost_sigma_deg: float = 12.0
     agreeing_frames: int = 3
+    lasting_share: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -149,7 +153,8 @@ class Tracker:
         if self._filter is None:
             return TrackedPose(None, None, TrackState.LOST, False)
         pose = self._filter.pose @ inverse(self._camera_from_centred)
-        covariance = _turned(self._filter.covariance[:6, :6], self._filter.pose[:3, :3])
+        lasting = self.settings.lasting_share * self._filter.newest
+        covariance = _turned(self._filter.covariance[:6, :6] + lasting, self._filter.pose[:3, :3])
         return TrackedPose(pose, covariance, TrackState.TRACKING if used else TrackState.COASTING, used)
 
 
@@ -164,13 +169,13 @@ class _Measured:
 
 class _Filter:
     """pose: camera from the centred world; twist (6,) per second; covariance (12, 12) of the errors (e, d) with
-    true pose = pose exp(e), true twist = twist + d."""
+    true pose = pose exp(e), true twist = twist + d. newest (6, 6): covariance of the frame used last."""
 
     def __init__(self, first: _Measured, settings: TrackerSettings):
         self._settings = settings
         self._noise = _axes(settings.turn_change_deg_s, settings.velocity_change_mm_s) ** 2
         self._time_s = first.time_s
-        self.pose, self.twist = first.pose, np.zeros(6)
+        self.pose, self.twist, self.newest = first.pose, np.zeros(6), first.covariance
         self.covariance = np.zeros((12, 12))
         self.covariance[:6, :6] = first.covariance
         self.covariance[6:, 6:] = np.diag(_axes(settings.turn_deg_s, settings.velocity_mm_s) ** 2)
@@ -205,6 +210,7 @@ class _Filter:
         kept[:, :6] -= gain
         covariance = kept @ self.covariance @ kept.T + gain @ measured.covariance @ gain.T
         self.covariance = (covariance + covariance.T) / 2
+        self.newest = measured.covariance
 
     def is_vague(self) -> bool:
         worst = [np.linalg.eigvalsh(self.covariance[part, part])[-1] for part in (slice(0, 3), slice(3, 6))]
