@@ -47,6 +47,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/geometry/__init__.py
   ExpectedAppearancesLib/geometry/camera.py
   ExpectedAppearancesLib/geometry/pose.py
+  ExpectedAppearancesLib/geometry/se3.py
   ExpectedAppearancesLib/geometry/silhouette.py
   ExpectedAppearancesLib/masks/__init__.py
   ExpectedAppearancesLib/masks/exposed.py
@@ -70,12 +71,15 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/poses/sampling.py
   ExpectedAppearancesLib/registration/__init__.py
   ExpectedAppearancesLib/registration/confidence.py
+  ExpectedAppearancesLib/registration/covariance.py
   ExpectedAppearancesLib/registration/decoding.py
+  ExpectedAppearancesLib/registration/footage.py
   ExpectedAppearancesLib/registration/pnp.py
   ExpectedAppearancesLib/registration/poses_file.py
   ExpectedAppearancesLib/registration/predictor.py
   ExpectedAppearancesLib/registration/record.py
   ExpectedAppearancesLib/registration/refinement.py
+  ExpectedAppearancesLib/registration/tracking.py
   ExpectedAppearancesLib/runs/__init__.py
   ExpectedAppearancesLib/runs/closing.py
   ExpectedAppearancesLib/runs/command_line_module.py

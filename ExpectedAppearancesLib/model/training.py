@@ -22,6 +22,7 @@ from ..evaluation.metrics import add_mm
 from ..masks.exposed import exposed_vessels
 from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
+from ..registration.covariance import CovarianceModel, calibrate_covariance, correlated, pose_error
 from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
 from ..registration.predictor import EXPOSED_VESSELS_NAME
 from ..registration.refinement import VesselAligner
@@ -187,6 +188,7 @@ class _Trainer:
         confidence = calibrate(evidence.reshape(usable.sum(), EVIDENCE[self.preset.estimator]), good[usable])
         probability = np.array([confidence.probability(r.evidence) for r in readings])
         accepted = probability >= confidence.threshold
+        covariance = self._covariance(readings, calibration, positive, probability, confidence.threshold)
         held_out_add = self._add(self._read(validation), validation)
         figures = {
             "add_mm_mean": round(float(held_out_add.mean()), 4),
@@ -207,6 +209,7 @@ class _Trainer:
             "encoding": self.encoding.to_dict(),
             "plausible_view": self.plausible.to_dict(),
             "confidence": confidence.to_dict(),
+            "covariance": covariance.to_dict(),
             "validation": figures,
             "vessels_sha256": self.case.manifest["inputs"]["vessels"]["sha256"],
         }
@@ -276,6 +279,17 @@ class _Trainer:
             for r, true in zip(readings, batch.camera_from_world, strict=True)
         ]
         return np.array(errors)
+
+    def _covariance(self, readings, batch: Batch, positive, probability, threshold: float) -> CovarianceModel:
+        """From the accepted of the true views, at least the more trusted half: a refused pose is not used."""
+        found = np.array([r.camera_from_world is not None for r in readings]) & positive
+        least = min(threshold, np.median(probability[found])) if found.any() else threshold
+        chosen = np.flatnonzero(found & (probability >= least))
+        centre = self.encoding.centre_world_mm
+        errors = [pose_error(batch.camera_from_world[i], readings[i].camera_from_world, centre) for i in chosen]
+        none = np.zeros((6, 6))
+        fits = [none if readings[i].fit is None else correlated(readings[i].fit, centre) for i in chosen]
+        return calibrate_covariance(np.array(errors).reshape(-1, 6), np.array(fits).reshape(-1, 6, 6))
 
     def _save(self) -> None:
         checkpoint.save(self.case.model_folder, self.network, self.average, self.best, self.optimizer, self.state)

@@ -20,13 +20,15 @@ ITERATIONS = 12
 class PoseFit:
     """camera_from_world (4, 4); centre_world_mm (3,): mean of the points; covariance (6, 6) of (rotation vector in the
     camera frame about that centre, rad; translation, mm), as if all residuals were independent; inlier_share;
-    residual: mean of |residual| / sigma."""
+    residual: mean of |residual| / sigma; residuals: how many points have weight."""
 
     camera_from_world: np.ndarray
     centre_world_mm: np.ndarray
     covariance: np.ndarray
     inlier_share: float
     residual: float
+    centre_world_mm: np.ndarray
+    residuals: int
 
     def expected_add_mm(self, radius_mm: float) -> float:
         """Root mean square displacement of points at `radius_mm` around the centre that the covariance stands for."""
@@ -99,7 +101,8 @@ def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_p
         return None
     inlier_share = float((distance < threshold_px).mean())
     pose = pose_from_rotation(rotation, position - rotation @ centre)
-    return PoseFit(pose, centre, np.linalg.inv(information), inlier_share, float(np.minimum(scaled, 10).mean()))
+    mean_residual = float(np.minimum(scaled, 10).mean())
+    return PoseFit(pose, centre, np.linalg.inv(information), inlier_share, mean_residual, int((weight > 0).sum()))
 
 
 def projection_jacobian(turned: np.ndarray, seen: np.ndarray, focal: np.ndarray) -> np.ndarray:

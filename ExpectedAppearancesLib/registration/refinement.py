@@ -85,7 +85,8 @@ class VesselAligner:
         pose = pose_from_rotation(rotation, position - rotation @ fit.centre_world_mm)
         turned_rad = np.linalg.norm(rotation_vector(rotation @ first.T))
         moved = np.hypot(np.linalg.norm(position - start), turned_rad * self._radius_mm * np.sqrt(2 / 3))
-        refined = replace(fit, camera_from_world=pose, covariance=np.linalg.inv(information))
+        # Neighbours that err together are in INDEPENDENT and PRIOR already.
+        refined = replace(fit, camera_from_world=pose, covariance=np.linalg.inv(information), residuals=1)
         residual = float(np.abs(distance[near]).mean() / scale)
         return Alignment(refined, float(near.sum() / max(1, inside.sum())), residual, float(moved))
 
