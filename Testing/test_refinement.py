@@ -42,7 +42,7 @@ def seen() -> tuple[np.ndarray, np.ndarray]:
 
 def fit_at(pose: np.ndarray) -> PoseFit:
     covariance = np.diag([2e-3**2] * 3 + [0.1**2, 0.1**2, 0.3**2])
-    return PoseFit(pose, MESH.centroid_mm, covariance, 1.0, 1.0)
+    return PoseFit(pose, MESH.centroid_mm, covariance, 1.0, 1.0, 1)
 
 
 def disturbed(seed: int, turn_deg: float, shift_mm) -> np.ndarray:

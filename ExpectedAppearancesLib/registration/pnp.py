@@ -27,7 +27,6 @@ class PoseFit:
     covariance: np.ndarray
     inlier_share: float
     residual: float
-    centre_world_mm: np.ndarray
     residuals: int
 
     def expected_add_mm(self, radius_mm: float) -> float:
