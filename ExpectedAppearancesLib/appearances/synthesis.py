@@ -46,14 +46,19 @@ class Synthesizer:
         loss = ClassGramLoss(self.vgg, labels, targets, CLASSES)
         start = torch.stack([self._start(job) for job in jobs])
         inside = (labels > 0)[:, None].float()
-        black = -torch.tensor(BGR_MEAN, device=self.device)[None, :, None, None]
+        outside = -torch.tensor(BGR_MEAN, device=self.device)[None, :, None, None] * (1 - inside)
+
+        def value_and_gradient(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            values, gradient = loss.value_and_gradient(x * inside + outside)
+            return values, gradient * inside
+
         images, distances = minimise(
-            lambda x: loss(x * inside + black * (1 - inside)),
+            value_and_gradient,
             start,
             self.iterations,
             after_iteration=lambda iteration, _values: on_iteration(iteration),
         )
-        images = images * inside + black * (1 - inside)
+        images = images * inside + outside
         return [(_to_rgb(image), float(distance)) for image, distance in zip(images, distances, strict=True)]
 
     def _target(self, texture: Texture, height: int, width: int) -> list[torch.Tensor]:
