@@ -1,27 +1,24 @@
 import itertools
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 import torch
-from cases import write_inputs
+from cases import label_map, texture
 
-from ExpectedAppearancesLib import files
-from ExpectedAppearancesLib.appearances import store
-from ExpectedAppearancesLib.appearances.gram import ClassGramLoss, class_gram, class_masks, texture_grams
+from ExpectedAppearancesLib.appearances.gram import ClassGramLoss, class_masks, texture_grams
+from ExpectedAppearancesLib.appearances.images import to_rgb, to_vgg_input
 from ExpectedAppearancesLib.appearances.lbfgs import minimise
-from ExpectedAppearancesLib.appearances.stage import synthesize_case
-from ExpectedAppearancesLib.appearances.synthesis import Job, Synthesizer
+from ExpectedAppearancesLib.appearances.measure import GramMeasure
+from ExpectedAppearancesLib.appearances.synthesis import Job, Synthesizer, _start
 from ExpectedAppearancesLib.appearances.vgg import load_vgg
-from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.cli import main
+from ExpectedAppearancesLib.appearances.workload import (
+    bytes_per_image,
+    fine_and_coarse,
+    images_at_once,
+    operations_per_evaluation,
+)
 from ExpectedAppearancesLib.devices import fast_dtype
-from ExpectedAppearancesLib.errors import CancelledError, InputError
-from ExpectedAppearancesLib.masks.stage import render_case
-from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
-from ExpectedAppearancesLib.textures.library import Texture
+from ExpectedAppearancesLib.errors import InputError
 
 CLASSES = (1, 2)
 CPU = torch.device("cpu")
@@ -30,21 +27,6 @@ CPU = torch.device("cpu")
 @pytest.fixture(scope="module")
 def vgg():
     return load_vgg()
-
-
-def label_map(size: int = 48) -> np.ndarray:
-    labels = np.zeros((size, size), np.uint8)
-    labels[4:-4, 2:-6] = 1
-    labels[size // 3 : size // 2, : size // 2] = 2
-    return labels
-
-
-def texture(name: str = "a", vessel_colour=(40, 30, 160), size: int = 48) -> Texture:
-    rng = np.random.default_rng(5)
-    labels = np.ones((size, size), np.uint8)
-    labels[size // 2 :, size // 3 : size // 2] = 2
-    image = np.where((labels == 2)[..., None], vessel_colour, (210, 130, 110)) + rng.normal(0, 15, (size, size, 3))
-    return Texture(name, np.clip(image, 0, 255).astype(np.uint8), labels)
 
 
 def tensors(seed: int):
@@ -65,13 +47,18 @@ def plain_features(vgg, x):
     return found
 
 
+def plain_gram(features, mask):
+    masked = (features * mask).flatten(2)[0]
+    return masked @ masked.T / (masked.numel() * mask.mean())
+
+
 def plain_loss(vgg, image, labels, targets):
     """Reference: autograd through masked features, whole masks, no pixel lists."""
     masks = vgg.carry_masks(class_masks(labels, CLASSES))
     total = 0
     for features, mask, target in zip(plain_features(vgg, image), masks, targets, strict=True):
         for c in range(len(CLASSES)):
-            difference = class_gram(features, mask[:, c]) - target[None, c]
+            difference = plain_gram(features, mask[:, c]) - target[c]
             total = total + difference.square().sum() / target[c].square().sum()
     return total
 
@@ -170,7 +157,7 @@ def test_directions_are_those_of_the_two_loop_recursion(history):
     matrix = rng.normal(size=(30, 30))
     matrix = matrix @ matrix.T / 30 + np.eye(30)
     offset = rng.normal(size=30)
-    x, pairs, previous = np.zeros(30), [], None
+    x, step, pairs, previous = np.zeros(30), None, [], None
     visited = []
     for _ in range(12):
         visited.append(x)
@@ -208,9 +195,12 @@ def test_one_hopeless_problem_does_not_spoil_its_neighbour():
 
 def test_each_class_takes_the_textures_colour_and_background_stays_black(vgg):
     job = Job(label_map(), texture(), seed=1)
-    ((image, distance),) = Synthesizer(vgg, CPU, 15).run([job])
-    ((_, first),) = Synthesizer(vgg, CPU, 0).run([job])
-    assert distance < 0.3 * first
+    (image,) = Synthesizer(vgg, CPU, 15).run([job])
+    before, after = (
+        sum(GramMeasure(vgg).distances(i, job.labels, job.texture).values())
+        for i in (to_rgb(_start(job)) * (job.labels > 0)[..., None], image)
+    )
+    assert after < 0.3 * before
     assert not image[job.labels == 0].any()
     means = {c: job.texture.image[job.texture.labels == c].astype(float).mean(axis=0) for c in CLASSES}
     for own, other in (CLASSES, CLASSES[::-1]):
@@ -220,10 +210,10 @@ def test_each_class_takes_the_textures_colour_and_background_stays_black(vgg):
 
 def test_same_seed_same_image_whatever_its_neighbours(vgg):
     jobs = [Job(label_map(), texture("a"), 3), Job(label_map().T.copy(), texture("b", (200, 180, 40)), 4)]
-    (first, _), (second, _) = Synthesizer(vgg, CPU, 6).run(jobs)
-    ((alone, _),) = Synthesizer(vgg, CPU, 6).run(jobs[1:])
+    first, second = Synthesizer(vgg, CPU, 6).run(jobs)
+    (alone,) = Synthesizer(vgg, CPU, 6).run(jobs[1:])
     np.testing.assert_array_equal(second, alone)
-    ((again, _),) = Synthesizer(vgg, CPU, 6).run(jobs[:1])
+    (again,) = Synthesizer(vgg, CPU, 6).run(jobs[:1])
     np.testing.assert_array_equal(first, again)
 
 
@@ -264,77 +254,79 @@ def test_torchvision_weights_give_the_same_features(tmp_path, vgg):
     torch.testing.assert_close(loaded(bgr)[0][inner], expected[inner], rtol=2e-3, atol=5e-3)
 
 
-@pytest.fixture
-def case(tmp_path):
-    paths = write_inputs(tmp_path)
-    case = Case.create(tmp_path / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
-    render_case(case, lambda *_: None, poses=3)
-    return case
+def test_half_the_size_first_gives_images_as_near_to_the_texture_for_less(vgg, monkeypatch):
+    """At 128 px and 10 iterations, 6 of them at half the size, against as many full-size ones for the same work."""
+    job = Job(label_map(128), texture("a", size=128), 1)
+    fine, coarse = fine_and_coarse(job.labels.shape, 10)
+    assert (fine, coarse) == (4, 6)
+    sizes = []
+    original = ClassGramLoss.value_and_gradient
+
+    def spy(self, images):
+        sizes.append(images.shape[-1])
+        return original(self, images)
+
+    monkeypatch.setattr(ClassGramLoss, "value_and_gradient", spy)
+    shares = []
+    (image,) = Synthesizer(vgg, CPU, 10).run([job], shares.append)
+    assert sizes == [64] * 7 + [128] * 5
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1.0)
+    measure = GramMeasure(vgg)
+    distance = sum(measure.distances(image, job.labels, job.texture).values())
+    monkeypatch.setattr("ExpectedAppearancesLib.appearances.synthesis.fine_and_coarse", lambda *_: (5, 0))
+    (full,) = Synthesizer(vgg, CPU, 5).run([job])
+    assert distance < sum(measure.distances(full, job.labels, job.texture).values())
 
 
-@pytest.mark.parametrize("method", ["surface", "image"])
-def test_a_killed_synthesis_goes_on_and_ends_as_if_it_had_not_been(case, method):
-    textures = [texture("a"), texture("b", (200, 180, 40))]
-
-    def cancel_in_second(fraction, _message):
-        if fraction > 0.6:
-            raise CancelledError("stop")
-
-    with pytest.raises(CancelledError):
-        synthesize_case(case, textures, cancel_in_second, method, size_px=48, iterations=4)
-    with pytest.raises(InputError, match="not finished"):
-        store.read_appearances(case, method)
-    folder = store.folder_of(case, method)
-    kept = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.png") if "labels" not in p.name}
-    assert kept
-    synthesize_case(case, textures, lambda *_: None, method, size_px=48, iterations=4)
-    _, resumed = store.read_appearances(case, method)
-    assert len(resumed) == (2 if method == "surface" else 3)
-    for name, stamp in kept.items():
-        assert (folder / name).stat().st_mtime_ns == stamp
-    images = {a.image_path.name: files.read_image_rgb(a.image_path) for a in resumed}
-    (folder / "index.json").unlink()
-    synthesize_case(case, textures, lambda *_: None, method, size_px=48, iterations=4)
-    for appearance in store.read_appearances(case, method)[1]:
-        np.testing.assert_array_equal(files.read_image_rgb(appearance.image_path), images[appearance.image_path.name])
+def test_the_measure_is_the_plain_loss_in_fp32_of_the_saved_image(vgg):
+    rng = np.random.default_rng(0)
+    image, labels, t = rng.integers(0, 256, (48, 48, 3), np.uint8), label_map(), texture()
+    targets = texture_grams(vgg, to_vgg_input(t.image), torch.from_numpy(t.labels), CLASSES)
+    expected = plain_loss(vgg, to_vgg_input(image)[None], torch.from_numpy(labels)[None], targets)
+    found = GramMeasure(vgg).distances(image, labels, t)
+    assert set(found) == {"parenchyma", "vessels"}
+    assert sum(found.values()) == pytest.approx(float(expected), rel=1e-4)
+    # The texture itself, on its own labels, is at no distance; a class that the labels lack is not counted.
+    assert sum(GramMeasure(vgg).distances(t.image, t.labels, t).values()) < 1e-6
+    assert set(GramMeasure(vgg).distances(image, np.minimum(labels, 1), t)) == {"parenchyma"}
 
 
-def test_a_changed_texture_or_axis_is_not_passed_over(case):
-    def made(textures):
-        synthesize_case(case, textures, lambda *_: None, "surface", size_px=32, iterations=1)
-        return {a.style: a.image_path.stat().st_mtime_ns for a in store.read_appearances(case, "surface")[1]}
-
-    first = made([texture("a"), texture("b")])
-    assert made([texture("a"), texture("b")]) == first
-    second = made([texture("a"), texture("b", (10, 200, 10))])
-    assert second["a"] == first["a"] and second["b"] != first["b"]
-    render_case(case, lambda *_: None, 3, craniotomy=find_craniotomy(case.vessels, normal=[0.3, 0, 1]))
-    third = made([texture("a"), texture("b", (10, 200, 10))])
-    assert third["a"] != second["a"] and third["b"] != second["b"]
-
-
-def test_paper_preset_makes_every_pose_with_every_texture(case):
-    textures = [texture("a"), texture("b")]
-    synthesize_case(case, textures, lambda *_: None, "image", size_px=32, iterations=1, every_texture=True)
-    _, appearances = store.read_appearances(case, "image")
-    assert len(appearances) == 6 and {a.style for a in appearances} == {"a", "b"}
+def test_targets_are_made_once_for_a_texture_and_only_few_are_kept(vgg, monkeypatch):
+    calls = []
+    original = texture_grams
+    monkeypatch.setattr(
+        "ExpectedAppearancesLib.appearances.synthesis.texture_grams", lambda *a: calls.append(1) or original(*a)
+    )
+    synthesizer = Synthesizer(vgg, CPU, 1)
+    for seed in range(3):
+        synthesizer.run([Job(label_map(), texture("a"), seed)])
+    assert len(calls) == 1
+    for i in range(20):
+        synthesizer._target(texture(f"t{i}"), 32, 32)
+    assert len(synthesizer._targets) <= 8
 
 
-def test_a_synthesis_killed_by_the_system_loses_no_finished_image(case, tmp_path):
-    for name in "abcdef":
-        files.write_png(tmp_path / "textures" / f"{name}.png", texture(name, size=96).image)
-    files.write_png(tmp_path / "textures" / "labels.png", texture(size=96).labels)
-    arguments = [str(case.folder), "--textures", str(tmp_path / "textures"), "--size", "48", "--iterations", "25"]
-    process = subprocess.Popen([sys.executable, "-m", "ExpectedAppearancesLib", "synthesize", *arguments])
-    folder = store.folder_of(case, "surface")
-    deadline = time.monotonic() + 120
-    while not (folder / "b-0.png").is_file() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.kill()
-    process.wait()
-    kept = {item["image"] for item in store.read_index(case, "surface")["items"]}
-    assert kept and not store.read_index(case, "surface")["done"]
-    stamps = {name: (folder / name).stat().st_mtime_ns for name in kept}
-    assert main(["synthesize", *arguments]) == 0
-    assert len(store.read_appearances(case, "surface")[1]) == 6
-    assert {name: (folder / name).stat().st_mtime_ns for name in kept} == stamps
+def test_operations_are_those_of_the_layers():
+    """By hand for VGG-16 at 32 px, one class on a quarter of the pixels."""
+    convolutions = (
+        32**2 * (3 * 64 + 64 * 64) + 16**2 * (64 * 128 + 128 * 128) + 8**2 * (128 * 256 + 2 * 256 * 256)
+        + 4**2 * (256 * 512 + 2 * 512 * 512) + 2**2 * 512 * 512
+    )  # fmt: skip
+    grams = 0.25 * (32**2 * 64**2 + 16**2 * 128**2 + 8**2 * 256**2 + 4**2 * 512**2 + 2**2 * 512**2)
+    expected = 2 * 2 * 9 * convolutions + 2 * 2 * grams
+    assert operations_per_evaluation((32, 32), "vgg16", (0.25,)) == pytest.approx(expected)
+
+
+def test_batch_follows_the_memory_that_is_free(monkeypatch):
+    import psutil
+
+    def with_free(amount):
+        monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": amount}))
+        return images_at_once((96, 96), 40, CPU)
+
+    each = bytes_per_image((96, 96), 40)
+    assert each > 96 * 96 * 3 * 4 * 2 * 40  # below 128 px the history is that of all iterations
+    assert with_free(1 << 40) == 14  # 2^17 px go through the network at once
+    network = 2600 * 2**17
+    assert with_free(network + 2 * 5 * each + each) == 5
+    assert with_free(1 << 20) == 1

@@ -20,14 +20,21 @@ def class_masks(labels: torch.Tensor, classes: tuple[int, ...]) -> torch.Tensor:
 
 def class_gram(features: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Gram matrices (B, K, K) of features (B, K, H, W) times mask (B, H, W), over elements x mean of the mask."""
-    batch, channels, height, width = features.shape
-    masked = (features.float() * mask[:, None]).reshape(batch, channels, height * width)
-    elements = channels * height * width * mask.mean(dim=(1, 2)).clamp_min(1e-8)
-    return torch.bmm(masked, masked.transpose(1, 2)) / elements[:, None, None]
+    masked = (features.float() * mask[:, None]).flatten(2)
+    masked = torch.nn.functional.pad(masked, (0, -masked.shape[2] % PIXELS_PER_SUM)).transpose(1, 2)
+    elements = features.shape[1] * mask.sum(dim=(1, 2)).clamp_min(1e-8)
+    return _gram(masked) / elements[:, None, None]
+
+
+def _gram(rows: torch.Tensor) -> torch.Tensor:
+    """(B, P, K) -> (B, K, K) float32; P is less than PIXELS_PER_SUM or a multiple of it."""
+    batch, pixels, channels = rows.shape
+    sums = rows.reshape(-1, min(PIXELS_PER_SUM, pixels), channels)
+    return torch.bmm(sums.transpose(1, 2), sums).view(batch, -1, channels, channels).float().sum(dim=1)
 
 
 @dataclass(frozen=True)
-class _ClassTerm:
+class ClassTerm:
     """What one class asks of one feature layer, for B images: their pixels, softened masks there and target Grams.
 
     pixels (B * P,) rows of the features laid out (B * H * W, K), those of full mask first, filled up to P with rows
@@ -43,7 +50,7 @@ class _ClassTerm:
     weight: torch.Tensor
 
     @staticmethod
-    def of(masks: torch.Tensor, target: torch.Tensor, dtype: torch.dtype) -> _ClassTerm | None:
+    def of(masks: torch.Tensor, target: torch.Tensor, dtype: torch.dtype) -> ClassTerm | None:
         """masks (B, H, W), target (B, K, K) with NaN where the texture lacks the class; None where nothing is asked."""
         usable = ~torch.isnan(target).flatten(1).any(dim=1)
         flat = masks.flatten(1) * usable[:, None]
@@ -60,7 +67,7 @@ class _ClassTerm:
         target = torch.where(usable[:, None, None], target, torch.zeros_like(target))
         norms = target.square().sum(dim=(1, 2))
         asked = usable & (counts > 0) & (norms > 0)
-        return _ClassTerm(
+        return ClassTerm(
             (order + offsets).flatten(),
             full,
             weights[:, full:, None].to(dtype),
@@ -77,9 +84,7 @@ class _ClassTerm:
         batch, channels = len(self.target), rows.shape[1]
         own = rows.index_select(0, self.pixels).view(batch, -1, channels)
         own[:, self.full :] *= self.soft
-        sums = own.view(-1, min(PIXELS_PER_SUM, own.shape[1]), channels)
-        gram = torch.bmm(sums.transpose(1, 2), sums).view(batch, -1, channels, channels).float().sum(dim=1)
-        difference = gram / self.elements - self.target
+        difference = _gram(own) / self.elements - self.target
         distance = (difference.square().sum(dim=2) * self.weight[:, 0]).sum(dim=1)
         if gradient_rows is not None:
             difference *= 4 * self.weight / self.elements
@@ -118,7 +123,7 @@ class ClassGramLoss:
             groups = [slice(b, b + 1) for b in range(len(labels))] if self._per_image else self._parts
             self._terms.append(
                 [
-                    [_ClassTerm.of(masks[g, c], target[g, c], vgg.compute_dtype) for c in range(len(classes))]
+                    [ClassTerm.of(masks[g, c], target[g, c], vgg.compute_dtype) for c in range(len(classes))]
                     for g in groups
                 ]
             )
@@ -145,8 +150,8 @@ class ClassGramLoss:
         self, total: torch.Tensor, part_index: int, layer: int, features: torch.Tensor, gradient: torch.Tensor | None
     ) -> None:
         part = self._parts[part_index]
-        flat = _rows(features)
-        flat_gradient = None if gradient is None else _rows(gradient)
+        flat = rows_of(features)
+        flat_gradient = None if gradient is None else rows_of(gradient)
         if not self._per_image:
             for term in filter(None, self._terms[layer][part_index]):
                 total[part] += term.add(flat, flat_gradient)
@@ -158,7 +163,7 @@ class ClassGramLoss:
                 total[part.start + b] += term.add(flat[own], None if gradient is None else flat_gradient[own])[0]
 
 
-def _rows(features: torch.Tensor) -> torch.Tensor:
+def rows_of(features: torch.Tensor) -> torch.Tensor:
     """Channels-last (B, K, H, W) seen as (B * H * W, K), the same memory."""
     return features.permute(0, 2, 3, 1).view(-1, features.shape[1])
 

@@ -15,7 +15,7 @@ SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "vgg16_imagenet_to_conv5_1
 VGG19_OFFICIAL = ("https://download.pytorch.org/models/vgg19-dcbb9e9d.pth", "dcbb9e9d")
 BGR_MEAN = (103.939, 116.779, 123.68)  # of ImageNet, 0..255
 CONVOLUTIONS = {"vgg16": (2, 2, 3, 3, 1), "vgg19": (2, 2, 4, 4, 1)}  # per block, up to conv5_1
-_WIDTHS = (64, 128, 256, 512, 512)
+WIDTHS = (64, 128, 256, 512, 512)
 
 
 class VggFeatures(torch.nn.Module):
