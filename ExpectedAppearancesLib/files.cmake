@@ -3,15 +3,21 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/__init__.py
   ExpectedAppearancesLib/__main__.py
   ExpectedAppearancesLib/appearances/__init__.py
+  ExpectedAppearancesLib/appearances/claims.py
   ExpectedAppearancesLib/appearances/contact_sheet.py
+  ExpectedAppearancesLib/appearances/executors.py
   ExpectedAppearancesLib/appearances/gram.py
+  ExpectedAppearancesLib/appearances/images.py
   ExpectedAppearancesLib/appearances/lbfgs.py
+  ExpectedAppearancesLib/appearances/measure.py
   ExpectedAppearancesLib/appearances/overview.py
   ExpectedAppearancesLib/appearances/projection.py
+  ExpectedAppearancesLib/appearances/shards.py
   ExpectedAppearancesLib/appearances/stage.py
   ExpectedAppearancesLib/appearances/store.py
   ExpectedAppearancesLib/appearances/synthesis.py
   ExpectedAppearancesLib/appearances/vgg.py
+  ExpectedAppearancesLib/appearances/workload.py
   ExpectedAppearancesLib/augmentation/__init__.py
   ExpectedAppearancesLib/augmentation/elastic.py
   ExpectedAppearancesLib/augmentation/impostors.py
