@@ -81,7 +81,7 @@ def _connect(executor: str):
         from dask.distributed import Client
     except ImportError as error:
         raise InputError(
-            "--executor: the Python package 'distributed' is not installed; install it with pip, or give local."
+            "--executor: dask.distributed is not installed; run: pip install 'expected-appearances[cluster]'"
         ) from error
     try:
         return Client(f"tcp://{executor.removeprefix(SCHEME)}", timeout=CONNECT_S)

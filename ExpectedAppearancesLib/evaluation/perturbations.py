@@ -17,7 +17,9 @@ from ..geometry.camera import Camera
 
 DARK = 12  # a pixel below this in every channel is no part of the lit field
 DISPLAY_GAMMA = 2.2
-SHIFT_WIDTH = 0.3  # sigma of the bulge of brain shift: narrower ones would fold the image over at 10 mm
+# Sigma of the bulge of brain shift across and along the way the tissue moves, in units of the field's size. Short along
+# that way, 10 mm would fold the image over.
+SHIFT_WIDTHS = (0.3, 1.2)
 
 
 @dataclass(frozen=True)
@@ -88,12 +90,14 @@ def shift_field(field: np.ndarray, shift_px: float, rng: np.random.Generator) ->
     """Displacement (H, W, 2), float32, px: one broad bulge to one side. Within the lit field (H, W), bool, its
     least-squares affine part is zero and its longest displacement `shift_px`."""
     field = field if field.any() else np.ones_like(field)
-    sigma = SHIFT_WIDTH * min(field.shape)
+    across_sigma, along_sigma = (width * np.sqrt(field.sum()) for width in SHIFT_WIDTHS)
     x, y = _grid(field.shape)
     rows, columns = np.nonzero(field)
     middle = [rng.uniform(*np.quantile(of, (0.3, 0.7))) for of in (columns, rows)]
     angle = rng.uniform(0, 2 * np.pi)
-    bulge = np.exp(-((x - middle[0]) ** 2 + (y - middle[1]) ** 2) / (2 * sigma**2))
+    along = np.cos(angle) * (x - middle[0]) + np.sin(angle) * (y - middle[1])
+    across = np.cos(angle) * (y - middle[1]) - np.sin(angle) * (x - middle[0])
+    bulge = np.exp(-0.5 * ((across / across_sigma) ** 2 + (along / along_sigma) ** 2))
     affine = np.stack([np.ones_like(x), x, y], axis=-1)
     bulge -= affine @ np.linalg.lstsq(affine[field], bulge[field], rcond=None)[0]
     bulge *= shift_px / np.abs(bulge[field]).max()

@@ -269,7 +269,7 @@ def _save(one: StudyCase, study: dict, settings: StudySettings) -> None:
         protocols = study["presets"][study["preset"]]
         study["protocols"] = {name: {k: entry[k] for k in ("per_style", "all")} for name, entry in protocols.items()}
         study["thresholds"] = {name: entry["thresholds"] for name, entry in protocols.items()}
-    study["settings"] = asdict(settings)
+    study["settings"] = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()}
     files.write_json(study_path(one.case.folder), study)
 
 

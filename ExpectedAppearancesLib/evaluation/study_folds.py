@@ -17,6 +17,7 @@ from .. import files
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, CancelledError, ExpectedAppearancesError, InputError
 
 PROTOCOLS = ("strict", "loto")
+COMMAND = (sys.executable, "-m", "ExpectedAppearancesLib")
 PATIENCE_S = 30.0  # that a stopped training is given to save what it has
 _PROGRESS = re.compile(r"^\s*(\d+) %  (.*)$")
 
@@ -82,7 +83,7 @@ def train_fold(
         shutil.rmtree(job.folder, ignore_errors=True)
         files.write_json(job.folder / "fold.json", {"settings": job.settings, "done": False})
     process = subprocess.Popen(
-        [sys.executable, "-m", "ExpectedAppearancesLib", *job.arguments()],
+        [*COMMAND, *job.arguments()],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

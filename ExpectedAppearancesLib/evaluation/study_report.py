@@ -30,7 +30,7 @@ summary { cursor: pointer; } details { margin: .6em 0; } .left { text-align: lef
 <h1>Study of {{ cases }}</h1>
 <p class="note">{{ date }} &middot; ExpectedAppearances {{ version }} &middot;
 for research only, not a medical device</p>
-<h2>Leave one texture out</h2>
+{% if all_rows %}<h2>Leave one texture out</h2>
 <p>For each texture a model is trained on appearances of the others and tested on frames of the one left out.
 <b>Strict</b>: every training view has a pose of its own, so neither texture nor pose of a test frame was ever seen.
 <b>Paper's form</b>: training views are seen from the very poses of the test frames, as in Haouchine et al., MICCAI
@@ -45,7 +45,7 @@ frames gives ADD {{ mean }} mm; answering the nearest other pose of the frames, 
 camera frame; lateral and depth are its parts across and along the optical axis. n mm-n deg: share of frames with less
 than n mm translation error at the mesh centroid and less than n degrees rotation error. AUC: area under the curve of
 ADD below 0 to 20 mm. Frames without a pose count as misses in shares and AUC. Refused frames that have a pose are in
-these figures; rows "accepted only" leave them out.</p>
+these figures; rows "accepted only" leave them out.</p>{% endif %}
 {% if curves %}<h2>Accuracy against threshold</h2><img src="{{ curves }}" alt="Accuracy-threshold curves">{% endif %}
 {% if bars %}<h2>Each left-out texture</h2><img src="{{ bars }}" alt="Mean ADD on each left-out texture">{% endif %}
 {% for name, rows in per_style %}<details><summary>{{ name }}</summary>{{ figures(rows, "left-out texture") }}</details>
