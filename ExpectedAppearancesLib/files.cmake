@@ -35,6 +35,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/cli/progress.py
   ExpectedAppearancesLib/cli/register.py
   ExpectedAppearancesLib/cli/render.py
+  ExpectedAppearancesLib/cli/study.py
   ExpectedAppearancesLib/cli/synthesize.py
   ExpectedAppearancesLib/cli/train.py
   ExpectedAppearancesLib/demo/__init__.py
@@ -48,7 +49,14 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/evaluate.py
   ExpectedAppearancesLib/evaluation/metrics.py
   ExpectedAppearancesLib/evaluation/overlays.py
+  ExpectedAppearancesLib/evaluation/perturbations.py
   ExpectedAppearancesLib/evaluation/report.py
+  ExpectedAppearancesLib/evaluation/robustness.py
+  ExpectedAppearancesLib/evaluation/study.py
+  ExpectedAppearancesLib/evaluation/study_figures.py
+  ExpectedAppearancesLib/evaluation/study_folds.py
+  ExpectedAppearancesLib/evaluation/study_report.py
+  ExpectedAppearancesLib/executor.py
   ExpectedAppearancesLib/files.py
   ExpectedAppearancesLib/geometry/__init__.py
   ExpectedAppearancesLib/geometry/camera.py
@@ -65,6 +73,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/model/encoding.py
   ExpectedAppearancesLib/model/export.py
   ExpectedAppearancesLib/model/feeder.py
+  ExpectedAppearancesLib/model/fold.py
   ExpectedAppearancesLib/model/losses.py
   ExpectedAppearancesLib/model/networks.py
   ExpectedAppearancesLib/model/presets.py
