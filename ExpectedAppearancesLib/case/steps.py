@@ -47,8 +47,8 @@ class Chosen:
 
     changed: names of the inputs ("vessel model", ...) that differ from those of the case. camera: None where it is not
     given or wrong, then camera_problem says why. poses: {"poses", "seed", "ranges", "craniotomy"} as `render` records
-    them, None where they cannot be had. textures: name -> SHA-256 of image and labels, None while they are read.
-    synthesis: {"method", "size_px", "iterations"}. outdated: what the appearances show no longer, found by the caller.
+    them, None where they cannot be had. textures: name -> SHA-256 of image and labels, "" while it has not been read.
+    synthesis: {"size_px", "iterations"}. running: kinds of runs that go on.
     """
 
     folder: str = ""
@@ -58,7 +58,7 @@ class Chosen:
     camera_problem: str = ""
     poses: dict | None = None
     poses_problem: str = ""
-    textures: dict[str, str] | None = None
+    textures: dict[str, str] = field(default_factory=dict)
     textures_problem: str = ""
     synthesis: dict = field(default_factory=dict)
     preset: str = ""
@@ -146,8 +146,8 @@ def changes_of_textures(chosen: dict[str, str], index: dict) -> list[str]:
     made = {item["style"]: item.get("texture_sha256") for item in index["items"]}
     changes = [f"{name} was added" for name in chosen if name not in made]
     changes += [f"{name} was removed" for name in made if name not in chosen]
-    # Cases of older versions have no digests: nothing can be said about their textures.
-    return changes + [f"{name} was changed" for name in made if made[name] and chosen.get(name, made[name]) != made[name]]
+    # Without a digest, of one that is not read yet or in a case of an older version, nothing can be said.
+    return changes + [f"{n} was changed" for n in made if made[n] and chosen.get(n) and chosen[n] != made[n]]
 
 
 def _case(chosen: Chosen, recorded: Recorded) -> Step:
@@ -200,8 +200,6 @@ def _poses(chosen: Chosen, recorded: Recorded) -> Step:
 def _textures(chosen: Chosen) -> Step:
     if chosen.textures_problem:
         return Step(StepState.MISSING, chosen.textures_problem)
-    if chosen.textures is None:
-        return Step(StepState.READY, "Being read.")
     count = len(chosen.textures)
     if not count:
         return Step(StepState.MISSING, "The folder holds no textures: add photographs, or use the shipped ones.")
@@ -231,8 +229,8 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
             changed.append(name)
     if recorded.overview_changed:
         changed.append("the craniotomy")
-    if chosen.textures is not None:
-        changed += changes_of_textures(chosen.textures, index) if index["done"] else []
+    if index["done"]:
+        changed += changes_of_textures(chosen.textures, index)
     made = len(index["items"])
     if changed:
         return Step(StepState.STALE, f"Changed since they were made: {_listed(changed)}. Start makes what is missing.")

@@ -266,17 +266,13 @@ class PlanningSession:
         vessels, cortex = self._meshes(parameters)
         return not craniotomy_moved(vars(find_craniotomy(vessels, cortex, self.space(parameters))), vars(recorded))
 
-    def _textures(self, parameters) -> tuple[dict[str, str] | None, str]:
+    def _textures(self, parameters) -> tuple[dict[str, str], str]:
         folder = self.textures_folder(parameters)
         if not folder.is_dir():
-            return None, f"{folder}: is no longer there; choose another folder."
+            return {}, f"{folder}: is no longer there; choose another folder."
         found = self.texture_files(parameters)
         bad = [self.texture_problems[version] for version, *_ in found.values() if version in self.texture_problems]
-        if bad:
-            return None, "\n".join(bad)
-        if any(version not in self.texture_digests for version, *_ in found.values()):
-            return None, ""
-        return {name: self.texture_digests[version] for name, (version, *_) in found.items()}, ""
+        return {name: self.texture_digests.get(version, "") for name, (version, *_) in found.items()}, "\n".join(bad)
 
     def _once(self, name: str, version, make):
         """make(), again only where `version` changed; a failure is kept like a result."""

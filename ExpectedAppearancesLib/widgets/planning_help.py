@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import qt
 import slicer
 from slicer.i18n import tr as _
@@ -42,8 +44,9 @@ class HelpSection:
             self._checking.stop()
             self._checking = None
 
-    def on_install(self, wheels_folder: str | None = None) -> None:
-        def confirm(text: str) -> bool:
+    def on_install(self, wheels_folder: Path | None = None) -> None:
+        def confirm(names: list[str]) -> bool:
+            text = _("These Python packages will be installed into this Slicer:") + "\n\n" + "\n".join(names)
             return slicer.util.confirmOkCancelDisplay(text, windowTitle=_("Install Python packages"))
 
         with slicer.util.tryWithErrorDisplay(_("The packages could not be installed."), waitCursor=True):
@@ -56,7 +59,7 @@ class HelpSection:
     def on_install_from_folder(self) -> None:
         folder = qt.QFileDialog.getExistingDirectory(slicer.util.mainWindow(), _("Folder of wheels"), "")
         if folder:
-            self.on_install(folder)
+            self.on_install(Path(folder))
 
     def on_check(self) -> None:
         """In a process of its own: it loads torch."""

@@ -41,6 +41,7 @@ class TexturesSection(Section):
         ui.addPhotographButton.connect("clicked(bool)", lambda _checked=False: self.on_add())
         ui.removeTextureButton.connect("clicked(bool)", lambda _checked=False: self.on_remove())
         ui.texturesList.connect("itemSelectionChanged()", self.panel.refresh_soon)
+        self.button.connect("contentsCollapsed(bool)", lambda _collapsed: self.panel.refresh_soon())
 
     def refresh(self) -> None:
         p, ui = self.parameters, self.ui
@@ -60,7 +61,9 @@ class TexturesSection(Section):
         self.labelling.refresh()
         found = self.session.texture_files(p)
         versions = [version for version, *_rest in found.values()]
-        if versions != self._listed and self.panel.entered:
+        # Opening the module must not load OpenCV: textures are read when they are looked at or compared with.
+        wanted = not self.button.collapsed or self.panel.recorded.index is not None
+        if wanted and versions != self._listed:
             self._listed = versions
             self._stepper.start(self._show(found))
 
