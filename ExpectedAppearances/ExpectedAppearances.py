@@ -93,7 +93,11 @@ CHOICE_LABELS = {
         "RECORDED": "as saved in the case",
     },
     "Method": {"SURFACE": "whole surface (recommended)", "IMAGE": "one image for each pose (as in the paper)"},
-    "TrainingPreset": {"QUICK": "Quick", "BEST": "Best", "PAPER": "Paper"},
+    "TrainingPreset": {
+        "QUICK": "quick: for a processor",
+        "BEST": "best: for a graphics card",
+        "PAPER": "paper: for comparison only",
+    },
     "WhenClosing": {
         "ASK": "ask (on quitting, work goes on)",
         "DETACH": "work goes on and is found again",

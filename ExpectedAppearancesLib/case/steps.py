@@ -230,7 +230,8 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
     if recorded.overview_changed:
         changed.append("the craniotomy")
     if index["done"]:
-        changed += changes_of_textures(chosen.textures, index)
+        textures = changes_of_textures(chosen.textures, index)
+        changed += textures if len(textures) <= 2 else ["the textures"]
     made = len(index["items"])
     if changed:
         return Step(StepState.STALE, f"Changed since they were made: {_listed(changed)}. Start makes what is missing.")
@@ -273,7 +274,7 @@ def _validation(recorded: Recorded) -> Step:
         return Step(StepState.STALE, "The figures belong to an older model of this case.")
     if ready:
         return Step(StepState.DONE, "Ready: all limits are met.")
-    return Step(StepState.READY, "Not ready: " + _listed(list(reasons)) + ".")
+    return Step(StepState.MISSING, f"Not ready: {_counted(len(reasons), 'limit')} of 3 not met.")
 
 
 def _camera_changed(chosen: Chosen, recorded: Recorded) -> bool:

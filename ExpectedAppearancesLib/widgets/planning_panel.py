@@ -15,7 +15,7 @@ from ..case.steps import STEPS, Step, StepState, next_step
 from ..mrml.planning_adopt import adopt
 from ..mrml.planning_session import PlanningSession
 from ..runs.closing import OnClose, close_runs, going_on, question
-from ..runs.state import RunStatus
+from ..runs.state import RunState, RunStatus
 from .planning_appearances import AppearancesSection
 from .planning_case import CaseSection, MicroscopeSection
 from .planning_help import HelpSection
@@ -27,7 +27,6 @@ from .planning_training import TrainingSection
 from .planning_validation import ValidationSection
 
 REFRESH_MS = 30
-KINDS = ("render", "synthesize", "train")
 SECTIONS = (
     CaseSection,
     MicroscopeSection,
@@ -37,7 +36,7 @@ SECTIONS = (
     TrainingSection,
     ValidationSection,
 )
-FOLDED_WHEN_DONE = ("case", "microscope", "poses")  # the others show results worth seeing
+SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training"}
 
 
 class PlanningPanel:
@@ -56,7 +55,7 @@ class PlanningPanel:
         self._ending_timer = qt.QTimer()
         self._ending_timer.setInterval(500)
         self._ending_timer.connect("timeout()", self._poll_ending)
-        self.runs = {kind: RunWatch(kind, lambda status, k=kind: self._on_run(k, status)) for kind in KINDS}
+        self.runs = {kind: RunWatch(kind, lambda status, k=kind: self._on_run(k, status)) for kind in SECTION_OF_KIND}
         self.sections = {section.name: section(self) for section in SECTIONS}
         self.help = HelpSection(self)
 
@@ -185,6 +184,9 @@ class PlanningPanel:
             self.sections["training"].on_status(status)
         if not status.state.active:
             logging.info("Expected Appearances: %s is %s. %s", kind, status.state.value, status.problem)
+        if status.state is RunState.DONE and self.entered:
+            self.refresh()
+            self._go_on_from(SECTION_OF_KIND[kind])
         self.refresh_soon()
 
     def _show_next(self) -> None:
@@ -195,8 +197,11 @@ class PlanningPanel:
             self.ui.nextLabel.text = _("All done: the model is ready.")
         else:
             self.ui.nextLabel.text = f"<b>{_('Next')}: {title}.</b> {html.escape(step.text)}"
-        before, self._next = self._next, name
-        finished = before and before != name and self.steps[before].state is StepState.DONE
-        if finished and STEPS.index(name) > STEPS.index(before) and not self.sections[before].button.collapsed:
-            self.sections[name].button.collapsed = False
-            self.sections[before].button.collapsed = before in FOLDED_WHEN_DONE
+        self._next = name
+
+    def _go_on_from(self, finished: str) -> None:
+        """A run has finished a step that the user is looking at: open the next one."""
+        if self.steps[finished].state is StepState.DONE and not self.sections[finished].button.collapsed:
+            self.sections[self._next].button.collapsed = False
+            # Appearances and loss are worth seeing; label maps were looked at before.
+            self.sections[finished].button.collapsed = finished == "poses"

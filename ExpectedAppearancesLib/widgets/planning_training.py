@@ -16,12 +16,6 @@ from .planning_qt import allow, quiet
 from .planning_run import RunControls, started
 from .planning_section import Section, changed
 
-PRESET_HINTS = {
-    "quick": "For a computer without a graphics card.",
-    "best": "Larger and longer, for a graphics card.",
-    "paper": "The network, loss and schedule of the paper, for comparison.",
-}
-
 
 class TrainingSection(Section):
     name = "training"
@@ -56,7 +50,6 @@ class TrainingSection(Section):
             keys = self._device_keys()
             # A scene from a computer with another card: auto says what is done then.
             ui.deviceCombo.currentIndex = keys.index(p.device) if p.device in keys else 0
-        ui.presetHint.text = _(PRESET_HINTS[p.preset.value])
         problem = self.step.text if self.step.state is StepState.MISSING else ""
         before = self.panel.steps["appearances"]
         if before.state is not StepState.DONE:
