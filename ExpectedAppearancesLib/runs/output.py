@@ -6,10 +6,11 @@ import json
 import re
 from collections import deque
 from pathlib import Path
+from xml.sax.saxutils import unescape
 
 FIGURES_PREFIX = "figures "
 EXIT_PREFIX = "exit code "
-READ_AT_ONCE = 1 << 18
+READ_AT_ONCE = 1 << 16
 KEPT_LINES = 40
 _PROGRESS = re.compile(r"<filter-progress>\s*([^<]*?)\s*</filter-progress>")
 _COMMENT = re.compile(r"<filter-comment>(.*?)</filter-comment>")
@@ -64,7 +65,7 @@ class OutputReader:
                 pass
         comments = _COMMENT.findall(line)
         if comments:
-            self.message = comments[-1].strip()
+            self.message = unescape(comments[-1]).strip()
         if line.startswith(FIGURES_PREFIX):
             try:
                 self.figures.update(json.loads(line[len(FIGURES_PREFIX) :]))
