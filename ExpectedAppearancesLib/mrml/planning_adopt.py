@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from ..case.case import Case
 from ..case.steps import LENGTH_TOLERANCE_MM
 from ..poses.sampling import PoseRanges
@@ -27,12 +29,12 @@ def adopt(session: PlanningSession, parameters, scene) -> Case | None:
     synthesize = stages.get("synthesize", {})
     if synthesize.get("method"):
         parameters.method = type(parameters.method)(synthesize["method"])
-        parameters.sizePx = synthesize.get("size_px", parameters.sizePx)
-        parameters.iterations = synthesize.get("iterations", parameters.iterations)
+        _take(parameters, "sizePx", synthesize.get("size_px"))
+        _take(parameters, "iterations", synthesize.get("iterations"))
     preset = stages.get("train", {}).get("preset", {})
     if preset.get("name") in [choice.value for choice in type(parameters.preset)]:
         parameters.preset = type(parameters.preset)(preset["name"])
-        parameters.minutes = float(preset.get("minutes", parameters.minutes))
+        _take(parameters, "minutes", preset.get("minutes"))
     own_textures = case.folder / "textures"
     parameters.texturesPath = str(own_textures) if own_textures.is_dir() else parameters.texturesPath
     return case
@@ -60,14 +62,24 @@ def models_of(scene, case: Case) -> dict:
 def _adopt_poses(session: PlanningSession, parameters, case: Case, render: dict) -> None:
     ranges = PoseRanges.from_dict(render["ranges"])
     automatic = PoseRanges().resolved(case.camera, case.vessels.radius_mm)
-    parameters.tiltMaxDeg, parameters.rollMaxDeg = ranges.tilt_max_deg, ranges.roll_max_deg
-    parameters.inViewPercent = 100 * ranges.in_view_min
+    _take(parameters, "tiltMaxDeg", ranges.tilt_max_deg)
+    _take(parameters, "rollMaxDeg", ranges.roll_max_deg)
+    _take(parameters, "inViewPercent", 100 * ranges.in_view_min)
     parameters.distanceAuto = all(
         abs(a - b) < LENGTH_TOLERANCE_MM for a, b in zip(ranges.working_distance_mm, automatic.working_distance_mm)
     )
-    parameters.nearestMm, parameters.farthestMm = ranges.working_distance_mm
+    _take(parameters, "nearestMm", ranges.working_distance_mm[0])
+    _take(parameters, "farthestMm", ranges.working_distance_mm[1])
     parameters.lateralAuto = abs(ranges.lateral_offset_mm - automatic.lateral_offset_mm) < LENGTH_TOLERANCE_MM
-    parameters.lateralMm = ranges.lateral_offset_mm
-    parameters.poseCount, parameters.seed = render["poses"], render["seed"]
+    _take(parameters, "lateralMm", ranges.lateral_offset_mm)
+    _take(parameters, "poseCount", render["poses"])
+    parameters.seed = render["seed"]
     source = "fitted" if session.is_fitted(parameters) else "recorded"
     parameters.craniotomySource = type(parameters.craniotomySource)(source)
+
+
+def _take(parameters, name: str, value) -> None:
+    """Set a parameter where there is a value within its bounds; else the step shows in what the case differs."""
+    if value is not None:
+        with contextlib.suppress(ValueError):
+            setattr(parameters, name, type(getattr(parameters, name))(value))

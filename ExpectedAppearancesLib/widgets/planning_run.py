@@ -10,7 +10,6 @@ from collections.abc import Callable
 import qt
 from slicer.i18n import tr as _
 
-from ..cli.progress import duration
 from ..errors import ExpectedAppearancesError
 from ..runs.runner import Run
 from ..runs.state import RunState, RunStatus, controls
@@ -99,17 +98,14 @@ class RunControls:
 
 
 def _line(status: RunStatus) -> str:
-    """What the run is doing, in one or two lines."""
+    """What the run is doing, in a line or two."""
     if status.problem:
         return status.problem
     if status.state is RunState.PREPARING:
         return _("Starting…")
     if status.state is RunState.CANCELLING:
         return _("Being ended…")
-    parts = [status.message]
-    if status.seconds_left is not None and status.state is RunState.RUNNING:
-        parts.append(_("{time} left").format(time=duration(status.seconds_left)))
-    return ", ".join(part for part in parts if part) if status.state is not RunState.IDLE else ""
+    return "" if status.state is RunState.IDLE else status.message  # which ends with the time left
 
 
 def started(panel, watch: RunWatch, arguments: list[str], environment: dict[str, str] | None = None) -> bool:

@@ -65,5 +65,8 @@ def changed(parameters, name: str, value) -> bool:
     """Set a parameter only where it differs: every write modifies the node and redraws the panel."""
     if parameters is None or getattr(parameters, name) == value:
         return False
-    setattr(parameters, name, value)
+    try:
+        setattr(parameters, name, value)
+    except ValueError:  # outside of the parameter's bounds
+        return False
     return True

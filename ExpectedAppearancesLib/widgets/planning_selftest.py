@@ -167,7 +167,7 @@ def test_from_models_to_a_trained_model(test) -> None:
     with _Folder() as folder:
         panel, _node = _with_models(folder)
         p = panel.parameters
-        p.poseCount, p.sizePx, p.iterations, p.minutes, p.device = 4, 64, 2, 0.05, "cpu"
+        p.poseCount, p.sizePx, p.iterations, p.minutes, p.device = 4, 64, 2, 0.1, "cpu"
         p.texturesPath = str(_few_textures(folder / "textures", 2))
         case = _saved(test, panel, folder)
         for name, button, kind in (
