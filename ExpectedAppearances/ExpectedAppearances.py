@@ -36,9 +36,9 @@ class ExpectedAppearances(ScriptedLoadableModule):
         parent.dependencies = []
         parent.contributors = ["ExpectedAppearances developers"]
         parent.helpText = _(
-            "Plans the registration of a surgical microscope to preoperative MRI: from the surface model of the cortical "
-            "vessels it makes expected appearances of the cortex, trains this patient's model on them, and says how "
-            "accurate it is. Work through the sections from above; each says what it still needs. "
+            "Plans the registration of a surgical microscope to preoperative MRI: from the surface model of the "
+            "cortical vessels it makes expected appearances of the cortex, trains this patient's model on them, and "
+            "says how accurate it is. Work through the sections from above; each says what it still needs. "
             "Not for clinical use. See the "
             '<a href="https://github.com/ExpectedAppearances/SlicerExpectedAppearances/blob/main/docs/planning.md">'
             "guide</a>."

@@ -67,7 +67,9 @@ class CaseReader:
             except InputError:
                 rows = []
             used, now = study.get("appearances_sha256"), self._once(case.folder / MANIFEST_NAME, self._open)
-            trained_on = now[0].manifest["stages"].get("train", {}).get("appearances_sha256") if now and now[0] else None
+            trained_on = (
+                now[0].manifest["stages"].get("train", {}).get("appearances_sha256") if now and now[0] else None
+            )
             stale = bool(rows and used and trained_on and used != trained_on)
         if model:
             rows = rows + figures_of_model(model)

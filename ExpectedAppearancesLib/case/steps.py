@@ -254,7 +254,7 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     changed = []
     if _appearances_changed(stages, train, recorded.appearances_sha256):
         changed.append("the expected appearances")
-    if recorded.model and recorded.model.get("plausible_view") and _view_changed(recorded.model, stages["render"]):
+    if recorded.model and recorded.model.get("plausible_view") and _view_changed(recorded.model, stages.get("render")):
         changed.append("the poses")
     trained = train.get("preset", {}).get("name", "")
     if chosen.preset and trained and chosen.preset != trained:
@@ -291,7 +291,9 @@ def _appearances_changed(stages: dict, train: dict, appearances_sha256: str) -> 
     return stages.get("synthesize", {}).get("updated", "") > train.get("updated", "")
 
 
-def _view_changed(model: dict, render: dict) -> bool:
+def _view_changed(model: dict, render: dict | None) -> bool:
+    if not render:
+        return True
     view, ranges, craniotomy = model["plausible_view"], render["ranges"], render["craniotomy"]
     return not (
         _close(view["centre_world_mm"], craniotomy["centre_world_mm"], LENGTH_TOLERANCE_MM)

@@ -17,7 +17,7 @@ PROTOCOL_NAMES = {
 
 @dataclass(frozen=True)
 class Limits:
-    """add_mm: largest mean ADD. accepted_min, accuracy_min: least share, 0..1, of frames accepted and within 3mm-3deg."""
+    """add_mm: largest mean ADD. accepted_min, accuracy_min: least share, 0..1, of frames accepted, within 3mm-3deg."""
 
     add_mm: float = 3.0
     accepted_min: float = 0.5
@@ -50,7 +50,9 @@ def figures_of_study(study: dict) -> list[Figures]:
         for protocol in sorted(study["protocols"], key=lambda name: name != "strict"):
             content = study["protocols"][protocol]
             rows.append(_of_metrics(protocol, "", content["all"]))
-            rows += [_of_metrics(protocol, style, content["per_style"][style]) for style in sorted(content["per_style"])]
+            rows += [
+                _of_metrics(protocol, style, content["per_style"][style]) for style in sorted(content["per_style"])
+            ]
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"study.json: lacks {error}; run the study again.") from error
     return rows

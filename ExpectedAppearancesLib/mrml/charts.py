@@ -1,6 +1,6 @@
 """Tables and plots in the scene: the loss while a model is trained, and its figures of merit when it is.
 
-Nodes are found again by an attribute, so that drawing a plot anew, also after the scene was saved and opened, adds none.
+Nodes are found again by an attribute, so that drawing a plot anew, even in a scene that was saved, adds none.
 """
 
 from __future__ import annotations

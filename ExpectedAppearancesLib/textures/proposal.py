@@ -15,8 +15,10 @@ from .. import files
 from .library import BACKGROUND, PARENCHYMA, VESSELS
 
 WORKING_SIDE_PX = 512
-VESSEL_SIGMAS_PX = (2.0, 3.0, 4.5, 6.0)  # half the width of the vessels that are looked for, at the working size
+VESSEL_SIGMAS_PX = (5.0, 8.0, 12.0)  # half the width of the vessels that are looked for, at the working size
 DARK_LEVEL = 25  # of 255: outside of the microscope's field
+# Of Otsu's threshold: ridges that reach the second count, and what goes on from them above the first.
+RIDGE_LEVELS = (1.1, 2.2)
 SMALLEST_VESSEL_SHARE = 4e-4  # of the image; smaller ridges are arterioles and specular rims
 
 
@@ -32,7 +34,10 @@ def propose_labels(image_rgb: np.ndarray) -> np.ndarray:
     height, width = image_rgb.shape[:2]
     scale = min(1.0, WORKING_SIDE_PX / max(height, width))
     small = resize(
-        image_rgb, (max(1, round(height * scale)), max(1, round(width * scale))), anti_aliasing=True, preserve_range=True
+        image_rgb,
+        (max(1, round(height * scale)), max(1, round(width * scale))),
+        anti_aliasing=True,
+        preserve_range=True,
     )
     field = _largest(small.max(axis=-1) > DARK_LEVEL, label)
     green = np.where(field, small[..., 1], np.median(small[..., 1][field]) if field.any() else 0.0)
@@ -43,8 +48,8 @@ def propose_labels(image_rgb: np.ndarray) -> np.ndarray:
     ridges[~inside] = 0.0
     labels = np.where(field, PARENCHYMA, BACKGROUND).astype(np.uint8)
     if inside.any() and np.ptp(ridges[inside]) > 1e-6:
-        high = threshold_otsu(ridges[inside])
-        found = apply_hysteresis_threshold(ridges, 0.6 * high, 1.2 * high)
+        threshold = threshold_otsu(ridges[inside])
+        found = apply_hysteresis_threshold(ridges, *(level * threshold for level in RIDGE_LEVELS))
         components = label(found)
         sizes = np.bincount(components.ravel())
         keep = sizes >= SMALLEST_VESSEL_SHARE * found.size

@@ -24,8 +24,12 @@ class AppearancesSection(Section):
         self._shown: tuple | None = None
         self._method: str | None = None
         self.controls = RunControls(
-            self.panel.runs["synthesize"], ui.appearancesStart, ui.appearancesCancel, ui.appearancesProgress,
-            ui.appearancesLine, _("Make images of what the cortex could look like in the operating room."),
+            self.panel.runs["synthesize"],
+            ui.appearancesStart,
+            ui.appearancesCancel,
+            ui.appearancesProgress,
+            ui.appearancesLine,
+            _("Make images of what the cortex could look like in the operating room."),
         )
         ui.appearancesStart.connect("clicked(bool)", lambda _checked=False: self.on_start())
         ui.appearancesCancel.connect("clicked(bool)", lambda _checked=False: self.controls.watch.cancel())

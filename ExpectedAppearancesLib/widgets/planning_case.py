@@ -117,8 +117,9 @@ class CaseSection(Section):
             return
         if not (Path(folder) / MANIFEST_NAME).is_file():
             slicer.util.errorDisplay(
-                _("{folder} is not the folder of a case: it holds no {name}. Choose another one, or make one with New.")
-                .format(folder=folder, name=MANIFEST_NAME)
+                _(
+                    "{folder} is not the folder of a case: it holds no {name}. Choose another, or make one with New."
+                ).format(folder=folder, name=MANIFEST_NAME)
             )
             return
         self.panel.open_folder(folder, take_over=True)
@@ -172,8 +173,13 @@ class CaseSection(Section):
                 folder.rename(_kept_name(folder))
                 made.rename(folder)
         except OSError as error:
-            self._tell([_("{folder}: could not be replaced ({error}); close what uses it, and save again.").format(
-                folder=folder, error=error)])
+            self._tell(
+                [
+                    _("{folder}: could not be replaced ({error}); close what uses it, and save again.").format(
+                        folder=folder, error=error
+                    )
+                ]
+            )
             return
         self.panel.open_folder(str(folder))
 
@@ -205,7 +211,9 @@ class MicroscopeSection(Section):
             return
         at_mm = p.viewedAtMm if not from_file else 300.0
         lens = _(", lens distortion corrected") if camera.is_distorted else ""
-        self.ui.microscopeSummary.text = _("{width} × {height} px; sees {wide:.0f} × {high:.0f} mm at {at:.0f} mm{lens}").format(
+        self.ui.microscopeSummary.text = _(
+            "{width} × {height} px; sees {wide:.0f} × {high:.0f} mm at {at:.0f} mm{lens}"
+        ).format(
             width=camera.width,
             height=camera.height,
             wide=at_mm * camera.width / camera.fx,

@@ -32,7 +32,11 @@ class PosesSection(Section):
         self._renderer = None  # (meshes, camera), MaskRenderer
         self._slice_before = None
         self.controls = RunControls(
-            self.panel.runs["render"], ui.renderButton, ui.renderCancelButton, ui.renderProgress, ui.renderLine,
+            self.panel.runs["render"],
+            ui.renderButton,
+            ui.renderCancelButton,
+            ui.renderProgress,
+            ui.renderLine,
             _("Draw the label map of every pose: what each camera would see of vessels and cortex."),
         )
         ui.craniotomySelector.connect("currentNodeChanged(vtkMRMLNode*)", self.on_node)
@@ -85,7 +89,9 @@ class PosesSection(Section):
                         changed(p, name, round(float(value), 1))
 
     def _refresh_cameras(self, p, sampler) -> None:
-        wanted = (sampler, min(p.poseCount, SHOWN_CAMERAS)) if sampler and p.showCameras and self.panel.entered else None
+        wanted = (
+            (sampler, min(p.poseCount, SHOWN_CAMERAS)) if sampler and p.showCameras and self.panel.entered else None
+        )
         if wanted == self._drawn:
             return
         self._drawn = wanted
@@ -145,9 +151,12 @@ class PosesSection(Section):
         plane_mm = planning.plane_through(sampler.craniotomy.centre_world_mm, pose)
         volume = planning.show_mask(scene, self._seen, labels, camera, pose, plane_mm, space)
         self._seen["camera"] = planning.line_model(
-            scene, self._seen.get("camera"), planning.LOOKED_THROUGH,
+            scene,
+            self._seen.get("camera"),
+            planning.LOOKED_THROUGH,
             planning.frustum_polydata(camera, pose[None], np.array([plane_mm]), space),
-            planning.LOOKED_THROUGH_COLOUR, 2.0,
+            planning.LOOKED_THROUGH_COLOUR,
+            2.0,
         )
         self._show_slice(volume, camera, pose, plane_mm, space)
         tilt, distance_mm = planning.view_direction(pose, sampler.craniotomy)

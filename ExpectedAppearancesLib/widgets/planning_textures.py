@@ -50,7 +50,9 @@ class TexturesSection(Section):
         if ui.texturesPathEdit.currentPath != path:
             with quiet(ui.texturesPathEdit):
                 ui.texturesPathEdit.currentPath = path
-        allow(ui.shippedButton, _("The shipped textures are chosen.") if shipped else "", _("Use the shipped textures."))
+        allow(
+            ui.shippedButton, _("The shipped textures are chosen.") if shipped else "", _("Use the shipped textures.")
+        )
         allow(ui.addPhotographButton, self.labelling.reason, _("Add a photograph of cortex and label its vessels."))
         reason = ""
         if shipped:
@@ -122,7 +124,9 @@ class TexturesSection(Section):
         """Choose a photograph; it is labelled in the Segment Editor, and then saved as NAME.png, NAME.labels.png."""
         if not path:
             path = qt.QFileDialog.getOpenFileName(
-                slicer.util.mainWindow(), _("Photograph of cortex"), str(Path.home()),
+                slicer.util.mainWindow(),
+                _("Photograph of cortex"),
+                str(Path.home()),
                 _("Images (*.png *.jpg *.jpeg *.tif *.tiff)"),
             )
         if not path or not self._own_folder():
@@ -133,7 +137,9 @@ class TexturesSection(Section):
             slicer.util.errorDisplay(str(error))
             return
         except ImportError:
-            slicer.util.errorDisplay(_("Reading photographs needs the Python package cv2: install what is missing first."))
+            slicer.util.errorDisplay(
+                _("Reading photographs needs the Python package cv2: install what is missing first.")
+            )
             return
         taken = list_textures(self.session.textures_folder(self.parameters))
         name = stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in Path(path).stem) or "photograph"
@@ -149,7 +155,9 @@ class TexturesSection(Section):
             return True
         case = self.session.case(p)
         if case is None:
-            slicer.util.errorDisplay(_("Choose a folder for your textures first, or save the case: then they go there."))
+            slicer.util.errorDisplay(
+                _("Choose a folder for your textures first, or save the case: then they go there.")
+            )
             return False
         folder = case.folder / "textures"
         if not folder.is_dir():
@@ -161,8 +169,12 @@ class TexturesSection(Section):
         folder = self.session.textures_folder(self.parameters)
         names = [item.data(qt.Qt.UserRole) for item in self.ui.texturesList.selectedItems()]
         listed = list_textures(folder)
-        if not names or not self.parameters.texturesPath or not slicer.util.confirmYesNoDisplay(
-            _("Delete {names} with labels from {folder}?").format(names=", ".join(names), folder=folder)
+        if (
+            not names
+            or not self.parameters.texturesPath
+            or not slicer.util.confirmYesNoDisplay(
+                _("Delete {names} with labels from {folder}?").format(names=", ".join(names), folder=folder)
+            )
         ):
             return
         for name in names:
@@ -179,8 +191,12 @@ def thumbnail(image_rgb: np.ndarray, labels: np.ndarray, side_px: int) -> np.nda
 
     side = min(image_rgb.shape[:2])
     top, left = ((length - side) // 2 for length in image_rgb.shape[:2])
-    image = cv2.resize(image_rgb[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_AREA)
-    shown = cv2.resize(labels[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_NEAREST)
+    image = cv2.resize(
+        image_rgb[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_AREA
+    )
+    shown = cv2.resize(
+        labels[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_NEAREST
+    )
     vessels = (shown == VESSELS).astype(np.uint8)
     image[(vessels == 1) & (cv2.erode(vessels, np.ones((3, 3), np.uint8)) == 0)] = OVERLAY_RGB
     return image

@@ -29,7 +29,11 @@ class TrainingSection(Section):
         self._plotted: tuple | None = None
         self._preset: str | None = None
         self.controls = RunControls(
-            self.panel.runs["train"], ui.trainingStart, ui.trainingCancel, ui.trainingProgress, ui.trainingLine,
+            self.panel.runs["train"],
+            ui.trainingStart,
+            ui.trainingCancel,
+            ui.trainingProgress,
+            ui.trainingLine,
             _("Train this patient's model on the expected appearances."),
         )
         ui.trainingStart.connect("clicked(bool)", lambda _checked=False: self.on_start())
@@ -59,7 +63,9 @@ class TrainingSection(Section):
         self.controls.refresh(problem, unfinished=self._unfinished())
         case = self.session.case(p)
         curve = self._curve(case)
-        allow(ui.showLossButton, "" if curve else _("Nothing has been trained yet."), _("Show the plot of loss and ADD."))
+        allow(
+            ui.showLossButton, "" if curve else _("Nothing has been trained yet."), _("Show the plot of loss and ADD.")
+        )
         if curve and (self.panel.runs["train"].active or charts.chart_of(self.panel.scene, "training.chart")):
             self._plot(curve)
 

@@ -54,5 +54,7 @@ class ValidationSection(Section):
         colour = READY_COLOUR if ready else NOT_READY_COLOUR
         lines = [f'<b style="color:{colour}">{head}</b>']
         lines += [f"– {html.escape(reason)}" for reason in reasons]
-        lines.append(_("Measured on: {protocol}.").format(protocol=_(PROTOCOL_NAMES.get(shown.protocol, shown.protocol))))
+        lines.append(
+            _("Measured on: {protocol}.").format(protocol=_(PROTOCOL_NAMES.get(shown.protocol, shown.protocol)))
+        )
         return "<br>".join(lines)
