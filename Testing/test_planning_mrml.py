@@ -424,3 +424,33 @@ def test_the_session_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+KEEP_THE_CONTEXT = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import cases, numpy as np, vtk
+from ExpectedAppearancesLib.geometry.pose import look_at
+from ExpectedAppearancesLib.masks.renderer import MaskRenderer
+pose = look_at(np.array([0.0, 0.0, 100.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+renderer = MaskRenderer(cases.vessels(), cases.dome(), cases.camera())
+view = vtk.vtkRenderWindow()
+view.AddRenderer(vtk.vtkRenderer())
+view.Render()
+renderer.render(pose)
+renderer.render_surface(pose)
+print(bool(view.IsCurrent()))
+"""
+
+
+def test_drawing_a_label_map_leaves_the_views_context_current():
+    """Slicer's views and the label maps share one thread; a display is needed to have two contexts."""
+    import shutil
+    import subprocess
+    from pathlib import Path
+
+    if shutil.which("xvfb-run") is None:
+        pytest.skip("xvfb-run is not installed, and without a display there is one context only")
+    command = ["xvfb-run", "-a", sys.executable, "-c", KEEP_THE_CONTEXT, str(Path(__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout.split()[-1:] == ["True"], done.stdout + done.stderr
