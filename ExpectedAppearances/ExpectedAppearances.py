@@ -184,8 +184,12 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         self.addObserver(scene, scene.EndImportEvent, self.onSceneEndImport)
         slicer.app.connect("aboutToQuit()", self.onQuit)
         self.initializeParameterNode()
+        if self.parent.isEntered:  # reloaded while it was shown
+            self.panel.enter()
 
     def cleanup(self):
+        if self.panel is None:
+            return
         slicer.app.disconnect("aboutToQuit()", self.onQuit)
         self.setParameterNode(None)
         self.panel.cleanup()

@@ -15,8 +15,10 @@ from ..case.case import MANIFEST_NAME
 from ..case.steps import StepState
 from ..errors import InputError
 from .planning_qt import Child, allow, library_command, problems_in, quiet
-from .planning_section import Section, changed
+from .planning_section import NodeWatch, Section, changed
 
+# Of models, segmentations and the transforms above them.
+NODE_EVENTS = ("ModifiedEvent", slicer.vtkMRMLTransformableNode.TransformModifiedEvent)
 SAVE_HINT = "Check models and microscope, and write them into the case folder."
 
 
@@ -26,6 +28,7 @@ class CaseSection(Section):
 
     def setup(self) -> None:
         self._saving: Child | None = None
+        self._watches = {name: NodeWatch(self.panel.refresh_soon) for name in ("vesselsNode", "cortexModel")}
         self.ui.vesselsSelector.connect("currentNodeChanged(vtkMRMLNode*)", self.on_vessels)
         self.ui.segmentSelector.connect("currentIndexChanged(int)", self.on_segment)
         self.ui.mriSelector.connect("currentNodeChanged(vtkMRMLNode*)", self.on_mri)
@@ -39,6 +42,8 @@ class CaseSection(Section):
         with quiet(self.ui.vesselsSelector):
             self.ui.vesselsSelector.setCurrentNode(p.vesselsNode)
         self._show_segments(p)
+        for name, watch in self._watches.items():
+            watch.watch(getattr(p, name), *NODE_EVENTS)
         folder = p.casePath
         self.ui.caseFolderLabel.text = Path(folder).name if folder else _("none")
         self.ui.caseFolderLabel.toolTip = folder
@@ -57,6 +62,8 @@ class CaseSection(Section):
             allow(button, reason, _(SAVE_HINT))
 
     def close(self) -> None:
+        for watch in self._watches.values():
+            watch.watch(None)
         if self._saving:
             self._saving.stop()
             self._saving = None

@@ -11,7 +11,7 @@ from ..mrml import planning
 from ..poses.craniotomy import disc_under_vessels
 from .planning_qt import Stepper, allow, quiet, single_shot
 from .planning_run import RunControls, started
-from .planning_section import Section, changed
+from .planning_section import NodeWatch, Section, changed
 
 SHOWN_CAMERAS = 40
 PREVIEW_HEIGHT_PX = 320  # a label map of this size is drawn in some 30 ms without a graphics card
@@ -31,6 +31,7 @@ class PosesSection(Section):
         self._drawn = self._looked = None  # what the cameras and the label map show
         self._renderer = None  # (meshes, camera), MaskRenderer
         self._slice_before = None
+        self._watch = NodeWatch(self.panel.refresh_soon)
         self.controls = RunControls(
             self.panel.runs["render"],
             ui.renderButton,
@@ -50,6 +51,8 @@ class PosesSection(Section):
         ui.craniotomyRow.visible = marked
         with quiet(ui.craniotomySelector):
             ui.craniotomySelector.setCurrentNode(p.craniotomyNode)
+        node = p.craniotomyNode if marked else None
+        self._watch.watch(node, *((node.PointModifiedEvent, node.PointRemovedEvent) if node else ()))
         for box in (ui.nearestSlider, ui.farthestSlider):
             allow(box, _("Taken from the field of view; untick to set it.") if p.distanceAuto else "", "")
         reason = _("A quarter of the vessels' radius; untick to set it.") if p.lateralAuto else ""
@@ -211,7 +214,9 @@ class PosesSection(Section):
         self._drawn = None
         self._stop_looking()
 
-    close = leave
+    def close(self) -> None:
+        self._watch.watch(None)
+        self.leave()
 
     def on_node(self, node) -> None:
         changed(self.parameters, "craniotomyNode", node)
@@ -225,8 +230,8 @@ class PosesSection(Section):
             node.CreateDefaultDisplayNodes()
             changed(p, "craniotomyNode", node)
         node.RemoveAllControlPoints()
+        slicer.modules.markups.logic().SetActiveList(node)
         slicer.modules.markups.logic().StartPlaceMode(False)
-        slicer.app.applicationLogic().GetSelectionNode().SetActivePlaceNodeID(node.GetID())
 
     def on_render(self) -> None:
         p = self.parameters

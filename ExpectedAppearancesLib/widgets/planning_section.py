@@ -61,6 +61,25 @@ class Section:
         show_status(getattr(self.ui, f"{self.name}Status"), step)
 
 
+class NodeWatch:
+    """Calls `action` when any of the given events happens to one node."""
+
+    def __init__(self, action):
+        self._action = action
+        self._node = None
+        self._tags: list[int] = []
+
+    def watch(self, node, *events) -> None:
+        """Watch this node, in place of the one before; None for none."""
+        if node is self._node:
+            return
+        if self._node is not None:
+            for tag in self._tags:
+                self._node.RemoveObserver(tag)
+        self._node = node
+        self._tags = [node.AddObserver(event, lambda *_event: self._action()) for event in events] if node else []
+
+
 def changed(parameters, name: str, value) -> bool:
     """Set a parameter only where it differs: every write modifies the node and redraws the panel."""
     if parameters is None or getattr(parameters, name) == value:
