@@ -105,7 +105,8 @@ def _line(status: RunStatus) -> str:
         return _("Starting…")
     if status.state is RunState.CANCELLING:
         return _("Being ended…")
-    return "" if status.state is RunState.IDLE else status.message  # which ends with the time left
+    # The message ends with the time left. What is done, the section says.
+    return "" if status.state in (RunState.IDLE, RunState.DONE) else status.message
 
 
 def started(panel, watch: RunWatch, arguments: list[str], environment: dict[str, str] | None = None) -> bool:
