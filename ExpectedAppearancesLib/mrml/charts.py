@@ -87,6 +87,11 @@ def chart_of(scene, role: str):
     return _find(scene, "vtkMRMLPlotChartNode", role)
 
 
+def table_of(scene):
+    """The table of the validation's figures drawn earlier, or None."""
+    return _find(scene, "vtkMRMLTableNode", "validation.table")
+
+
 def _chart(scene, role: str, title: str, x_title: str, y_title: str, series_nodes: list):
     chart = _node(scene, "vtkMRMLPlotChartNode", role, title)
     chart.SetTitle(title)

@@ -80,6 +80,8 @@ class Labelling:
 
     def edit(self) -> None:
         """Open the Segment Editor on the photograph."""
+        if slicer.util.mainWindow() is None:
+            return
         slicer.util.selectModule("SegmentEditor")
         editor = slicer.modules.segmenteditor.widgetRepresentation().self().editor
         editor.setSegmentationNode(self.nodes["segmentation"])

@@ -128,6 +128,76 @@ def test_textures_are_listed_and_labelled(test) -> None:
         test.assertIn("apricot", panel.steps["textures"].text)
 
 
+def test_photograph_becomes_a_texture(test) -> None:
+    if _lacks(test, "cv2") or _lacks(test, "skimage"):
+        return
+    with _Folder() as folder:
+        panel = _panel()
+        panel.parameters.texturesPath = str(_few_textures(folder / "textures", 1))
+        photograph = read_library(shipped_textures_folder())[1].image[:256, :256]
+        files.write_png(folder / "Foto 1.png", np.ascontiguousarray(photograph))
+        panel.sections["textures"].on_add(str(folder / "Foto 1.png"))
+        labelling_ = panel.sections["textures"].labelling
+        _wait(test, lambda: labelling_.nodes, 120)
+        proposed = labelling.labels_of(labelling_.nodes)
+        test.assertTrue((proposed == VESSELS).any())
+        panel = _panel()
+        test.assertFalse(panel.ui.addPhotographButton.enabled)
+        panel.ui.useLabelsButton.click()
+        test.assertEqual(labelling_.nodes, {})
+        panel.unfold("textures")
+        _wait(test, lambda: panel.ui.texturesList.count == 2)
+        np.testing.assert_array_equal(files.read_label_map(folder / "textures" / f"Foto_1{LABELS_SUFFIX}"), proposed)
+
+
+def test_verdict_follows_the_limits(test) -> None:
+    with _Folder() as folder:
+        panel, _node = _with_models(folder)
+        p = panel.parameters
+        case = _saved(test, panel, folder)
+        test.assertTrue(panel.ui.showFiguresButton.toolTip)
+        figures = {"add_mm_mean": 2.4, "add_mm_median": 2.0, "add_below_3mm": 0.9, "accepted_of_true": 0.7}
+        files.write_json(case.model_folder / "model.json", {"validation": figures})
+        panel.refresh()
+        test.assertIn(">Ready<", panel.ui.verdictLabel.text)
+        p.addLimitMm = 2.0
+        _wait(test, lambda: "Not ready" in panel.ui.verdictLabel.text)
+        test.assertIn("2.40 mm", panel.ui.verdictLabel.text)
+        panel.ui.showFiguresButton.click()
+        table = charts.table_of(slicer.mrmlScene)
+        test.assertEqual(table.GetCellText(0, table.GetColumnIndex("ADD mean (mm)")), "2.40")
+
+
+def test_run_is_found_again_and_cancelled(test) -> None:
+    """Left going on with its scene, found in the next one, and ended with it."""
+    missing = dependencies.missing("planning")
+    if missing:
+        test.delayDisplay(f"Skipped: {', '.join(missing)} not installed in this Slicer.")
+        return
+    with _Folder() as folder:
+        panel, _node = _with_models(folder)
+        _saved(test, panel, folder)
+        p = panel.parameters
+        p.poseCount, p.whenClosing = 1000, type(p.whenClosing)("detach")
+        panel.refresh()
+        panel.ui.renderButton.click()
+        _wait(test, lambda: panel.runs["render"].active, 60)
+        slicer.mrmlScene.Clear()
+        test.assertEqual(panel.running(), frozenset())
+
+        panel.open_folder(str(folder / "case"), take_over=True)
+        test.assertTrue(panel.ui.renderCancelButton.enabled)
+        _wait(test, lambda: panel.runs["render"].status.fraction > 0, 60)
+        run = panel.runs["render"].run
+        panel.parameters.whenClosing = type(p.whenClosing)("end")
+        slicer.mrmlScene.Clear()
+        _wait(test, lambda: not run.poll().state.active, 60)
+
+        panel.open_folder(str(folder / "case"), take_over=True)
+        test.assertEqual(panel.steps["poses"].state, StepState.READY, panel.steps["poses"].text)
+        test.assertIn("goes on where it was", panel.steps["poses"].text)
+
+
 def test_plots_leave_no_nodes_behind(test) -> None:
     scene = slicer.mrmlScene
     for steps in (3, 60):
@@ -208,7 +278,7 @@ class _Folder(tempfile.TemporaryDirectory):
     """A folder whose name has a space and is not ASCII, gone at the end; the panel lets go of it before."""
 
     def __init__(self):
-        super().__init__(prefix="Fälle Expected ", ignore_cleanup_errors=True)
+        super().__init__(prefix="Fälle Expected ")
 
     def __enter__(self) -> Path:
         return Path(super().__enter__())

@@ -38,7 +38,8 @@ class ValidationSection(Section):
         if not rows:
             return
         table, chart = charts.show_figures(self.panel.scene, rows, self.parameters.addLimitMm)
-        slicer.app.layoutManager().setLayout(slicer.vtkMRMLLayoutNode.SlicerLayoutFourUpPlotTableView)
+        if slicer.app.layoutManager():
+            slicer.app.layoutManager().setLayout(slicer.vtkMRMLLayoutNode.SlicerLayoutFourUpPlotTableView)
         slicer.modules.plots.logic().ShowChartInLayout(chart)
         selection = slicer.app.applicationLogic().GetSelectionNode()
         selection.SetActiveTableID(table.GetID())
