@@ -9,7 +9,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from ExpectedAppearancesLib.runs.state import RunState
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAD = ("category", "title", "description", "version", "documentation-url", "license", "contributor")
+RIVALS = {"probseg", "binseg"}  # presets that are trained to be compared with, not to be used
 SCALARS = {"integer": int, "double": float}
 TINY = replace(
     presets.PRESETS["quick"], size_px=64, steps=20, batch=4, fresh=4, validation_views=4, validate_every=10, width=0.4
@@ -50,7 +50,9 @@ def parameters(command: str) -> dict[str, ElementTree.Element]:
 
 
 def actions(command: str) -> dict[str, argparse.Action]:
-    return {a.dest: a for a in parser_of(command)._actions if not isinstance(a, argparse._HelpAction)}
+    """What the panel offers: all but the options in groups of their own, which serve studies."""
+    usual = [a for group in parser_of(command)._action_groups[:2] for a in group._group_actions]
+    return {a.dest: a for a in usual if not isinstance(a, argparse._HelpAction)}
 
 
 def as_slicer_passes(command: str, chosen: dict[str, str], widgets: bool = True) -> list[str]:
@@ -113,8 +115,11 @@ def test_description_and_command_agree(command):
         if action.choices:
             assert parameter.tag == "string-enumeration", name
             assert default in elements
-            assert elements == (["auto"] if action.default is None else []) + list(action.choices), name
+            offered = [choice for choice in action.choices if choice not in RIVALS]
+            assert elements == (["auto"] if action.default is None else []) + offered, name
             assert default == (action.default or "auto"), name
+        elif action.nargs == 0:
+            assert (parameter.tag, default) == ("boolean", "false"), name
         elif action.type in (int, float):
             assert SCALARS.get(parameter.tag) is action.type, name
             assert action.type(default) == (action.default or 0), name
@@ -164,6 +169,11 @@ def test_what_is_chosen_in_the_panel_reaches_the_command():
 def test_lists_are_taken_from_a_shell_and_from_slicer(arguments):
     args = parser_of("synthesize").parse_args(command_arguments("synthesize", arguments))
     assert (args.case, args.exclude, args.size) == ("/c", ["a", "b"], 64)
+
+
+def test_a_command_that_is_no_module_of_slicer_gets_its_options_as_they_are():
+    arguments = ["/c", "--poses", "5", "--seed", "0", "--bogus", "0", "-1.5", "auto"]
+    assert command_arguments("render", arguments) == arguments
 
 
 def test_what_is_wrong_still_reaches_the_command():
@@ -229,7 +239,10 @@ def test_synthesis_from_a_shell_and_through_the_runner(rendered):
 
 
 def test_bad_input_is_listed_and_ends_with_2(rendered, tmp_path):
-    done = shell("synthesize", rendered.folder, "--size", "7", "--textures", tmp_path / "none")
+    # As on a Windows whose code page lacks the letters of the path.
+    narrow = {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = shell("synthesize", rendered.folder, "--size", "7", "--textures", tmp_path / "none", **narrow)
+    assert str(rendered.folder) in done.stdout
     assert done.returncode == 2 and done.stdout.splitlines()[-1] == "exit code 2"
     assert "2 problems" in done.stderr and "--size: 7" in done.stderr
     status = Run.start("synthesize", rendered.folder, ["--size", "7", "--batch", "-1"]).wait(120)
@@ -247,7 +260,7 @@ def test_only_one_run_of_a_kind_works_on_a_case(rendered):
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_terminated_by_slicer_or_killed_it_can_be_resumed(rendered):
     """SIGTERM ends it with 3; SIGKILL, which Slicer's Cancel sends, ends it at once; the next start goes on."""
-    arguments = [str(rendered.folder), "--size", "96", "--iterations", "40", "--method", "image"]
+    arguments = [str(rendered.folder), "--size", "48", "--iterations", "8", "--preset", "paper"]
     command = [sys.executable, str(script_of("synthesize")), *arguments]
     folder = store.folder_of(rendered, "image")
     kept: set[str] = set()
@@ -263,7 +276,7 @@ def test_terminated_by_slicer_or_killed_it_can_be_resumed(rendered):
         index = files.read_json(folder / "index.json", "index")
         made = {item["image"] for item in index["items"]}
         assert not index["done"] and kept < made
-        assert all(files.read_image_rgb(folder / name).shape == (96, 96, 3) for name in made)
+        assert all(files.read_image_rgb(folder / name).shape == (48, 48, 3) for name in made)
         kept = made
 
 
@@ -276,10 +289,9 @@ def test_training_tells_its_losses(rendered, monkeypatch, capsys):
         if not (folder / item["image"]).is_file():  # the test above removed one
             files.write_png(folder / item["image"], files.read_image_rgb(next(folder.glob("*-0.png"))))
     monkeypatch.setitem(presets.PRESETS, "quick", TINY)
-    begin = time.monotonic()
     code = command_line_module.main("train", as_slicer_passes("train", {"case": str(rendered.folder), "device": "cpu"}))
     told = [f for f in figures(capsys.readouterr().out) if "step" in f]
-    assert code == 0, time.monotonic() - begin
+    assert code == 0
     assert [f["step"] for f in told] == [10, 20]
     assert all(isinstance(f["loss"], float) for f in told) and told[1]["validation_add_mm"] > 0
     assert result_problem("train", rendered.folder, thorough=True) == ""
@@ -295,7 +307,7 @@ def test_a_long_run_reports_less_often(capsys):
     progress = SlicerProgress("train", None)
     progress._clock = lambda: now_s
     progress._created_s = 0.0
-    for now_s in range(12 * 3600):
+    for now_s in range(0, 12 * 3600, 2):
         progress(now_s / 1e6, f"step {now_s}, loss -0.5")
     text = capsys.readouterr().out
     assert 5_000 < text.count("<filter-progress>") < 12_000 and len(text) < 3e6

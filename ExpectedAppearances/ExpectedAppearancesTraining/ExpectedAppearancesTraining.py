@@ -9,7 +9,7 @@ from pathlib import Path
 for _folder in Path(__file__).resolve().parents[:3]:
     for _candidate in (_folder / "qt-scripted-modules", _folder):
         if (_candidate / "ExpectedAppearancesLib" / "__init__.py").is_file() and str(_candidate) not in sys.path:
-            sys.path.append(str(_candidate))
+            sys.path.insert(1, str(_candidate))
 
 # Guarded: the process that renders training views imports this file again.
 if __name__ == "__main__":

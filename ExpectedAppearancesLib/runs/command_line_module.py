@@ -61,11 +61,11 @@ def command_arguments(command: str, arguments: Sequence[str]) -> list[str]:
             rest.append(flag)
             continue
         values = [value] if "=" in arguments[i - 1] else []
-        several = action.nargs in ("+", "*")
-        while i < len(arguments) and arguments[i] not in options and (several or not values):
+        most = 0 if values else len(arguments) if action.nargs in ("+", "*") else 1
+        while i < len(arguments) and len(values) < most and not arguments[i].startswith("--"):
             values.append(arguments[i])
             i += 1
-        if several:
+        if action.nargs in ("+", "*"):
             # slicer.cli.run makes "'a', 'b'" of the list ["a", "b"].
             values = [part.strip(" '\"") for text in values for part in text.split(",")]
         values = [value for value in values if not _left_out(action, value)]
@@ -146,6 +146,10 @@ class SlicerProgress(Progress):
 def main(command: str, arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code: 0 done, 2 bad input, 3 cancelled, 1 anything else."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        # Slicer and the runner read UTF-8; a path in another alphabet must not end the run.
+        with contextlib.suppress(AttributeError):
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
     progress = SlicerProgress(command, None)
     code = EXIT_FAILED
     try:

@@ -124,9 +124,10 @@ def slicer_packaging():
     """The module slicer.packaging (Slicer 5.11 and later) inside 3D Slicer's application, else None."""
     if "slicer" not in sys.modules or not hasattr(sys.modules["slicer"], "app"):
         return None
-    if importlib.util.find_spec("slicer.packaging") is None:
+    try:
+        packaging = importlib.import_module("slicer.packaging")
+    except ModuleNotFoundError:
         return None
-    packaging = importlib.import_module("slicer.packaging")
     return packaging if hasattr(packaging, "pip_ensure") else None
 
 
@@ -219,3 +220,10 @@ def _pip_log(folder: Path) -> Iterator[Path]:
             del os.environ["PIP_LOG"]
         else:
             os.environ["PIP_LOG"] = usual
+
+
+def system_report() -> str:
+    """See `system_report.system_report`; takes seconds, `system_report.SystemCheck` does not."""
+    from .system_report import system_report
+
+    return system_report()

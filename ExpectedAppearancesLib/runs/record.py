@@ -51,6 +51,8 @@ def read_record(case_folder: Path, kind: str) -> RunRecord | None:
         record = RunRecord(**{f.name: content[f.name] for f in fields(RunRecord)})
     except (InputError, KeyError):
         return None
+    if not isinstance(record.pid, int) or not isinstance(record.mark, str) or not record.mark:
+        return None
     return record if record.host == platform.node() else None
 
 

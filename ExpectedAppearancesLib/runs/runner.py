@@ -20,7 +20,7 @@ from .state import RunState, RunStatus
 
 CANCEL_DEADLINE_S = 10.0  # after which the processes are no longer asked to end
 SWEEP_DEADLINE_S = 5.0
-START_LOCK_S = 5.0
+START_LOCK_S = 1.0
 TAIL_LINES = 8
 NEEDED_PACKAGES = ("psutil", "filelock")
 KEPT = "What was finished is kept; the next start goes on from there."
@@ -35,14 +35,22 @@ class Run:
         self._record = record
         self._tree = processes.ProcessTree(record.pid, record.created_s, record.mark)
         self._output = OutputReader(self.case_folder / record.log, from_the_end)
-        self._cancel_deadline: float | None = None
+        # One that an earlier program began to cancel, and did not live to see the end of, is ended here.
+        self._cancel_deadline = time.monotonic() + CANCEL_DEADLINE_S if record.cancelled else None
         self._sweep_deadline: float | None = None
         self._final: RunStatus | None = None
 
     @staticmethod
-    def start(kind: str, case_folder: Path, arguments: list[str], python: str | None = None) -> Run:
+    def start(
+        kind: str,
+        case_folder: Path,
+        arguments: list[str],
+        python: str | None = None,
+        environment: dict[str, str] | None = None,
+    ) -> Run:
         """Start `kind` ("synthesize", "train", or another command) on the case with the command's own options.
 
+        environment: variables to set beside this process's own, such as CUDA_VISIBLE_DEVICES to choose a GPU.
         Raises InputError: no case, a run of this kind is going on in it, or it cannot be started.
         """
         missing = [name for name in NEEDED_PACKAGES if importlib.util.find_spec(name) is None]
@@ -60,12 +68,14 @@ class Run:
                         f"{folder}: a run of '{kind}' is going on in this case (process {previous.pid}, since "
                         f"{previous.started}); wait until it has ended, or cancel it."
                     )
+                if not previous.outcome:
+                    _tree_of(previous).kill()  # orphans of a crash that nobody has seen
                 remove_partial_files(folder, [previous.pid])
             log = _new_log(folder, kind)
             mark = uuid.uuid4().hex
             command = command_of(kind, folder, [str(argument) for argument in arguments], python)
             try:
-                tree = processes.start(command, environment_of(mark), folder / log)
+                tree = processes.start(command, environment_of(mark) | (environment or {}), folder / log)
             except OSError as error:
                 raise InputError(
                     f"{python}: cannot be started ({error.strerror or error}); repair this Python."
@@ -104,9 +114,11 @@ class Run:
         if self._final is not None:
             return self._final
         if self._tree.running():
-            if self._cancel_deadline is not None and time.monotonic() > self._cancel_deadline:
-                self._tree.kill()
             self._output.read()
+            # After its last words an interpreter may still tidy up for seconds.
+            said_all = self._output.exit_code is not None
+            if self._cancel_deadline is not None and (said_all or time.monotonic() > self._cancel_deadline):
+                self._tree.kill()
             return self._status(self._active_state())
         if self._sweep_deadline is None:
             self._sweep_deadline = time.monotonic() + SWEEP_DEADLINE_S
@@ -117,7 +129,9 @@ class Run:
             self._tree.kill()
             if time.monotonic() < self._sweep_deadline:
                 return self._status(self._active_state())
-        remove_partial_files(self.case_folder, {self._record.pid, self._output.figures.get("pid", self._record.pid)})
+        told = self._output.figures.get("pid")  # another one where a launcher stands between
+        pids = {self._record.pid} | ({told} if isinstance(told, int) else set())
+        remove_partial_files(self.case_folder, pids)
         self._final = self._judged()
         self._record = update_record(self.case_folder, self._record, outcome=self._final.state.value)
         return self._final
@@ -168,7 +182,7 @@ class Run:
 
     def _judged(self) -> RunStatus:
         code = self._tree.exit_code()
-        if code is None:
+        if code is None or (self._record.cancelled and self._output.exit_code is not None):
             code = self._output.exit_code
         unfinished = result_problem(self.kind, self.case_folder) if code == EXIT_DONE else ""
         if code == EXIT_DONE and not unfinished:

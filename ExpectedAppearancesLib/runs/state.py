@@ -26,7 +26,7 @@ class RunState(Enum):
 class RunStatus:
     """fraction: 0..1. exit_code: None while it runs, negative for a signal, None also when nobody could know it.
     problem: in the user's words, '' if none. values: the newest figures that the run has told, such as step, loss,
-    validation_add_mm (train) or image, images, images_planned (synthesize)."""
+    validation_add_mm (train) or image, the newest one's path, and images (synthesize)."""
 
     state: RunState
     fraction: float = 0.0
