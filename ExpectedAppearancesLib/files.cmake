@@ -26,6 +26,8 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py
+  ExpectedAppearancesLib/case/recorded.py
+  ExpectedAppearancesLib/case/steps.py
   ExpectedAppearancesLib/cli/__init__.py
   ExpectedAppearancesLib/cli/check.py
   ExpectedAppearancesLib/cli/demo.py
@@ -56,6 +58,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/study_figures.py
   ExpectedAppearancesLib/evaluation/study_folds.py
   ExpectedAppearancesLib/evaluation/study_report.py
+  ExpectedAppearancesLib/evaluation/verdict.py
   ExpectedAppearancesLib/executor.py
   ExpectedAppearancesLib/files.py
   ExpectedAppearancesLib/geometry/__init__.py
@@ -80,6 +83,11 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/model/training.py
   ExpectedAppearancesLib/model/views.py
   ExpectedAppearancesLib/mrml/__init__.py
+  ExpectedAppearancesLib/mrml/charts.py
+  ExpectedAppearancesLib/mrml/labelling.py
+  ExpectedAppearancesLib/mrml/planning.py
+  ExpectedAppearancesLib/mrml/planning_adopt.py
+  ExpectedAppearancesLib/mrml/planning_session.py
   ExpectedAppearancesLib/mrml/scene.py
   ExpectedAppearancesLib/poses/__init__.py
   ExpectedAppearancesLib/poses/craniotomy.py
@@ -112,6 +120,22 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
+  ExpectedAppearancesLib/textures/proposal.py
+  ExpectedAppearancesLib/widgets/__init__.py
+  ExpectedAppearancesLib/widgets/planning_appearances.py
+  ExpectedAppearancesLib/widgets/planning_case.py
+  ExpectedAppearancesLib/widgets/planning_devices.py
+  ExpectedAppearancesLib/widgets/planning_help.py
+  ExpectedAppearancesLib/widgets/planning_labelling.py
+  ExpectedAppearancesLib/widgets/planning_panel.py
+  ExpectedAppearancesLib/widgets/planning_poses.py
+  ExpectedAppearancesLib/widgets/planning_qt.py
+  ExpectedAppearancesLib/widgets/planning_run.py
+  ExpectedAppearancesLib/widgets/planning_section.py
+  ExpectedAppearancesLib/widgets/planning_selftest.py
+  ExpectedAppearancesLib/widgets/planning_textures.py
+  ExpectedAppearancesLib/widgets/planning_training.py
+  ExpectedAppearancesLib/widgets/planning_validation.py
   )
 set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md

@@ -74,6 +74,7 @@ def train_case(
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
     folder = fold.folder if fold else case.model_folder
     trainer = _Trainer(case, preset, encoding, device, seed, views, folder)
+    made_from = files.sha256(folder_of(case, method) / "index.json")
     progress(0.0, "rendering validation views")
     workers = max(1, (os.cpu_count() or 2) - 1)
     validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
@@ -87,7 +88,14 @@ def train_case(
     figures = trainer.export(calibration, validation, on_record)
     if fold is None:
         model_sha256 = files.sha256(case.model_folder / "model.onnx")
-        case.record("train", done=True, validation=figures, method=method, model_sha256=model_sha256)
+        case.record(
+            "train",
+            done=True,
+            validation=figures,
+            method=method,
+            appearances_sha256=made_from,
+            model_sha256=model_sha256,
+        )
     return figures
 
 
