@@ -39,6 +39,7 @@ class Feed:
     def __init__(self, source: Source, deliver: Callable[[LiveFrame], None], retry_s: float = RETRY_S):
         self._source, self._deliver, self._retry_s = source, deliver, retry_s
         self._stopping = threading.Event()
+        self._holding = False
         self._status = FeedStatus(FeedState.OPENING)
         self._thread = threading.Thread(target=self._run, name="ExpectedAppearances frames", daemon=True)
 
@@ -48,6 +49,10 @@ class Feed:
 
     def start(self) -> None:
         self._thread.start()
+
+    def hold(self, holding: bool) -> None:
+        """Pause a source that can wait; one that cannot is read on, and its frames are for the receiver to leave."""
+        self._holding = holding
 
     def stop(self, timeout_s: float = STOP_S) -> bool:
         """End the thread. False when it hangs in a driver: it then delivers nothing any more and ends by itself."""
@@ -78,7 +83,15 @@ class Feed:
                 self._set(FeedState.STOPPED)
 
     def _read_until_lost(self) -> None:
+        held = False
         while not self._stopping.is_set():
+            if self._holding and self._source.can_wait:
+                held = True
+                self._stopping.wait(POLL_S)
+                continue
+            if held:
+                held = False
+                self._source.go_on()
             try:
                 frame = self._source.read()
             except InputError as error:  # one bad frame: say so and go on

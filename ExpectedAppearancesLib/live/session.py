@@ -117,6 +117,8 @@ class LiveSession:
     def push(self, frame: LiveFrame) -> None:
         """Give a frame, from any thread; it waits at most for the frame in flight."""
         if self._running and not self._frozen:
+            if self._single and self._feed:
+                self._feed.hold(True)  # the frame after this one is for the next step
             self._worker.submit(frame)
 
     def say_source(self, status: FeedStatus) -> None:
@@ -127,14 +129,17 @@ class LiveSession:
         """Hold the frame that is shown, with its overlay; frames that come meanwhile are not looked at."""
         if self._shown is not None:
             self._frozen = True
+            self._hold_source(True)
             self._worker.forget()
 
     def resume(self) -> None:
         self._frozen = self._single = False
+        self._hold_source(False)
 
     def next_frame(self) -> None:
-        """Register one more frame, then hold again."""
+        """Register one more frame, then hold again; of files and videos it is the very next one."""
         self._frozen, self._single = False, True
+        self._hold_source(False)
 
     def tick(self, wait_s: float = 0.0) -> Update:
         """Take what is new and judge it. wait_s: up to this long, which lets the session's threads run meanwhile."""
@@ -166,6 +171,10 @@ class LiveSession:
         ended = self._feed.stop() if self._feed else True
         self._feed, self._shown = None, None
         return self._worker.stop() and ended
+
+    def _hold_source(self, holding: bool) -> None:
+        if self._feed:
+            self._feed.hold(holding)
 
     def _register(self, frame: LiveFrame) -> LiveResult:
         """In the worker's thread: everything that costs time."""

@@ -34,13 +34,17 @@ class SourceEnded(ExpectedAppearancesError):
 
 
 class Source(Protocol):
-    """What a feed reads. dropped: frames that the source itself left out to keep pace."""
+    """What a feed reads. dropped: frames that the source itself left out to keep pace. can_wait: whether the next frame
+    is still there after a pause; `go_on` ends one."""
 
     dropped: int
+    can_wait: bool
 
     def open(self) -> None: ...
 
     def read(self) -> LiveFrame | None: ...
+
+    def go_on(self) -> None: ...
 
     def close(self) -> None: ...
 
@@ -66,6 +70,7 @@ class ImageFiles:
         self._interval_s = 1 / max(rate_hz, 0.01)
         self._repeat, self._only_new, self._given, self._clock = repeat, only_new, given or {}, clock
         self.dropped = 0
+        self.can_wait = True
         self._number = 0
         self._seen: set[Path] | None = None
         self._unfinished: dict[Path, tuple[tuple, float]] = {}
@@ -98,6 +103,9 @@ class ImageFiles:
         elif not self._folder:
             raise SourceEnded("the last image was shown.")
         return None
+
+    def go_on(self) -> None:
+        self._due_s = self._clock()
 
     def close(self) -> None:
         self._unfinished = {}
@@ -146,6 +154,7 @@ class VideoFile:
     def __init__(self, path: Path, repeat: bool = False, clock: Callable[[], float] = time.monotonic):
         self._path, self._repeat, self._clock = Path(path), repeat, clock
         self.dropped = 0
+        self.can_wait = True
         self._number = 0
         self._capture = None
 
@@ -183,6 +192,9 @@ class VideoFile:
         self._number += 1
         return LiveFrame(np.ascontiguousarray(image[..., ::-1]), self._clock(), self._number - 1, f"{self._number - 1}")
 
+    def go_on(self) -> None:
+        self._due_s = self._clock()
+
     def close(self) -> None:
         if self._capture is not None:
             self._capture.release()
@@ -195,6 +207,7 @@ class CaptureDevice:
     def __init__(self, device: int | str, clock: Callable[[], float] = time.monotonic, capture=cv2.VideoCapture):
         self._device, self._clock, self._make_capture = device, clock, capture
         self.dropped = 0
+        self.can_wait = False
         self._number = 0
         self._capture = None
 
@@ -216,6 +229,9 @@ class CaptureDevice:
         if image.ndim == 3 and image.shape[2] == 3:
             image = np.ascontiguousarray(image[..., ::-1])
         return LiveFrame(image, self._clock(), self._number - 1, f"{self._number - 1}")
+
+    def go_on(self) -> None:
+        """Nothing was missed that could be had."""
 
     def close(self) -> None:
         if self._capture is not None:

@@ -20,6 +20,7 @@ from .live_scene import FRAME, ROLE_ATTRIBUTE, TRANSFORM, LiveScene, node_of_rol
 from .live_stream import pixels_of
 
 NOTE = "note"
+SEQUENCE_ATTRIBUTE = ROLE_ATTRIBUTE + ".Sequence"
 BROWSER_ATTRIBUTE = "ExpectedAppearances.Recording"
 BROWSER_NAME = "Microscope recording"
 DEFAULT_LIMIT_MB = 2048
@@ -34,23 +35,16 @@ class Recorder:
         self._begin_s: float | None = None
         self.mb = 0.0
         self.frames = 0
-        self.browser = self._scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", BROWSER_NAME)
-        self.browser.SetAttribute(BROWSER_ATTRIBUTE, "1")
-        self.browser.SetPlaybackRateFps(20.0)
         self.sequences = {}
         note = node_of_role(self._scene, NOTE) or self._scene.AddNewNodeByClass("vtkMRMLTextNode", "Registration")
         note.SetAttribute(ROLE_ATTRIBUTE, NOTE)
-        self._note = note
-        for role, proxy in ((FRAME, live_scene.frame), (TRANSFORM, live_scene.transform), (NOTE, note)):
+        self._proxies = {FRAME: live_scene.frame, TRANSFORM: live_scene.transform, NOTE: note}
+        for role, proxy in self._proxies.items():
             sequence = self._scene.AddNewNodeByClass("vtkMRMLSequenceNode", f"{BROWSER_NAME} {proxy.GetName()}")
             sequence.SetIndexName("time")
             sequence.SetIndexUnit("s")
-            sequence.SetIndexTypeToNumeric()
-            sequence.SetAttribute(ROLE_ATTRIBUTE + ".Sequence", role)
-            self.browser.AddSynchronizedSequenceNodeID(sequence.GetID())
-            self.browser.AddProxyNode(proxy, sequence, False)
-            self.browser.SetOverwriteProxyName(sequence, False)
-            self.browser.SetSaveChanges(sequence, False)
+            sequence.SetIndexType(sequence.NumericIndex)
+            sequence.SetAttribute(SEQUENCE_ATTRIBUTE, role)
             self.sequences[role] = sequence
 
     @property
@@ -72,24 +66,34 @@ class Recorder:
             result.camera,
             Prediction(prediction.camera_from_world, result.accepted, prediction.confidence, prediction.latency_ms),
         )
-        self._note.SetText(to_note(frame, result.case_key))
-        for role, node in ((FRAME, self._live.frame), (TRANSFORM, self._live.transform), (NOTE, self._note)):
-            self.sequences[role].SetDataNodeAtValue(node, index)
+        self._proxies[NOTE].SetText(to_note(frame, result.case_key))
+        for role, sequence in self.sequences.items():
+            sequence.SetDataNodeAtValue(self._proxies[role], index)
         self.mb += result.image_rgb.nbytes / 2**20
         self.frames += 1
         return True
 
     def finish(self):
-        """The browser, at its first frame; None and no nodes when nothing was recorded."""
-        if self.frames:
-            self.browser.SetSelectedItemNumber(0)
-            return self.browser
-        for sequence in self.sequences.values():
-            self._scene.RemoveNode(sequence)
-        self._scene.RemoveNode(self.browser)
-        if self._scene.IsNodePresent(self._note):
-            self._scene.RemoveNode(self._note)
-        return None
+        """The browser, at its last frame, which is the one on the screen; None and no nodes when nothing was recorded.
+
+        Only now: a browser that is there plays into the live nodes with every frame that is added.
+        """
+        if not self.frames:
+            for node in (*self.sequences.values(), self._proxies[NOTE]):
+                self._scene.RemoveNode(node)
+            return None
+        browser = self._scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", BROWSER_NAME)
+        browser.SetAttribute(BROWSER_ATTRIBUTE, "1")
+        browser.SetPlaybackRateFps(20.0)
+        was_modifying = browser.StartModify()
+        for role, sequence in self.sequences.items():
+            browser.AddSynchronizedSequenceNodeID(sequence.GetID())
+            browser.AddProxyNode(self._proxies[role], sequence, False)
+            browser.SetOverwriteProxyName(sequence, False)
+            browser.SetSaveChanges(sequence, False)
+        browser.SetSelectedItemNumber(self.frames - 1)
+        browser.EndModify(was_modifying)
+        return browser
 
 
 def recordings(scene) -> list:
@@ -98,6 +102,13 @@ def recordings(scene) -> list:
     found.UnRegister(None)
     nodes = [found.GetItemAsObject(i) for i in range(found.GetNumberOfItems())]
     return [node for node in nodes if node.GetAttribute(BROWSER_ATTRIBUTE)]
+
+
+def pause_playback(scene) -> None:
+    """Recordings play into the nodes that a session shows its frames in: not both at once."""
+    for browser in recordings(scene):
+        if browser.GetPlaybackActive():
+            browser.SetPlaybackActive(False)
 
 
 def recorded_frames(browser, pixels: bool = True) -> Iterator[tuple[RecordedFrame, str]]:
@@ -154,7 +165,7 @@ def _sequence(browser, role: str):
     collection.UnRegister(None)
     for i in range(collection.GetNumberOfItems()):
         node = collection.GetItemAsObject(i)
-        if node.GetAttribute(ROLE_ATTRIBUTE + ".Sequence") == role and browser.IsSynchronizedSequenceNodeID(
+        if node.GetAttribute(SEQUENCE_ATTRIBUTE) == role and browser.IsSynchronizedSequenceNodeID(
             node.GetID(), True
         ):
             return node

@@ -52,6 +52,9 @@ class LiveScene:
         self.camera: Camera | None = None
         self.camera_to_ras = np.eye(4)
         self.plane_mm = FIRST_PLANE_MM
+        self._view_pixel_mm = 0.0
+        self._drawn: dict[str, tuple] = {}
+        self._stamp: tuple | None = None
         self.models = scenes.add_case_models(scene, case)
         for name, node in self.models.items():
             _mark(node, name)
@@ -80,11 +83,36 @@ class LiveScene:
             self.draw(result.overlay, result.camera)
         self.set_overlay_visible(result.overlay is not None)
         self.show_truth(None, None)
+        self._stamp = self._newest_change()
         return changed
+
+    @property
+    def intact(self) -> bool:
+        """Whether frame and transform are still as `show` left them: a recording plays into the same nodes."""
+        return self._stamp is None or self._stamp == self._newest_change()
+
+    def _newest_change(self) -> tuple:
+        data = self.frame.GetImageData()
+        return data.GetMTime() if data is not None else 0, self.transform.GetTransformToWorldMTime()
+
+    def take_replayed(self, camera: Camera) -> bool:
+        """The frame node was given a recorded frame of `camera`. True when the plane or the frame's size changed."""
+        from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+        matrix = vtkMatrix4x4()
+        self.frame.GetIJKToRASMatrix(matrix)
+        return self._put_plane(camera, matrix.GetElement(2, 3))
+
+    def put_plane_at(self, depth_mm: float) -> None:
+        """Put the frame that is shown at that distance from the camera."""
+        if self._put_plane(self.camera, depth_mm):
+            self._place_frame()
 
     def set_pose(self, camera_from_world: np.ndarray) -> None:
         self.camera_to_ras = camera_to_ras(camera_from_world, self._case.space)
         scenes.set_pose(self.transform, self.camera_to_ras)
+        if self._stamp is not None:
+            self._stamp = self._newest_change()
 
     def draw(self, overlay: Overlay, camera: Camera) -> None:
         """Outline, box and fill of a pose, onto the image plane."""
@@ -101,6 +129,16 @@ class LiveScene:
         if overlay is not None:
             self._draw_lines(TRUTH, camera, overlay.outline_px, overlay.outline_lines)
         _set_visible(self.lines[TRUTH], overlay is not None)
+
+    def set_view_pixel(self, view_pixel_mm: float) -> None:
+        """Tell the size of the microscope view's pixels on the image plane; the lines are drawn anew if it changed.
+
+        Slicer draws an image half a pixel of the view to the right of, and above, models at the same place.
+        """
+        if abs(view_pixel_mm - self._view_pixel_mm) > 0.02 * view_pixel_mm:
+            self._view_pixel_mm = view_pixel_mm
+            for role, drawn in self._drawn.items():
+                self._draw_lines(role, *drawn)
 
     def set_overlay_visible(self, visible: bool) -> None:
         """Show or hide all that depends on the pose: outline, fill, box and frustum."""
@@ -128,13 +166,18 @@ class LiveScene:
         plane_mm = self.plane_mm
         if overlay is not None and abs(overlay.depth_mm / plane_mm - 1) > PLANE_CHANGE:
             plane_mm = overlay.depth_mm
-        if camera == self.camera and plane_mm == self.plane_mm:
+        return self._put_plane(camera, plane_mm)
+
+    def _put_plane(self, camera: Camera, plane_mm: float) -> bool:
+        if camera == self.camera and abs(plane_mm - self.plane_mm) < 1e-6:
             return False
         self.camera, self.plane_mm = camera, plane_mm
-        if self.frustum is not None:
-            self._scene.RemoveNode(self.frustum)
-        self.frustum = _mark(scenes.add_frustum(self._scene, camera, plane_mm, self.transform), FRUSTUM)
-        self.frustum.SetSelectable(False)
+        if self.frustum is None:
+            self.frustum = _mark(scenes.add_frustum(self._scene, camera, plane_mm, self.transform), FRUSTUM)
+            self.frustum.SetSelectable(False)
+            self.frustum.SetSaveWithScene(False)
+        else:
+            scenes.set_frustum(self.frustum, camera, plane_mm)
         return True
 
     def _set_pixels(self, image_rgb: np.ndarray, changed: bool) -> None:
@@ -144,10 +187,13 @@ class LiveScene:
             return
         was_modifying = self.frame.StartModify()
         if changed:
-            self.frame.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(self.camera, self.plane_mm)))
-            self.frame.SetAndObserveTransformNodeID(self.transform.GetID())
+            self._place_frame()
         _set_image(self.frame, image_rgb)
         self.frame.EndModify(was_modifying)
+
+    def _place_frame(self) -> None:
+        self.frame.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(self.camera, self.plane_mm)))
+        self.frame.SetAndObserveTransformNodeID(self.transform.GetID())
 
     def _add_lines(self, role: str):
         from vtkmodules.vtkCommonDataModel import vtkPolyData
@@ -157,7 +203,9 @@ class LiveScene:
         node.CreateDefaultDisplayNodes()
         node.SetAndObserveTransformNodeID(self.transform.GetID())
         node.SetSelectable(False)
+        node.SetSaveWithScene(False)  # in a saved scene nobody would judge whether it may be shown
         display = node.GetDisplayNode()
+        display.SetSaveWithScene(False)
         display.SetColor(*RGB[role])
         display.SetLighting(False)
         display.SetLineWidth(2)
@@ -168,7 +216,9 @@ class LiveScene:
         return node
 
     def _draw_lines(self, role: str, camera: Camera, points_px: np.ndarray, lines: np.ndarray) -> None:
+        self._drawn[role] = (camera, points_px, lines)
         plane = scenes.camera_from_pixel(camera, self.plane_mm)
+        plane[:2, 3] += 0.5 * self._view_pixel_mm, -0.5 * self._view_pixel_mm
         points_mm = np.column_stack([points_px, np.zeros(len(points_px))]) @ plane[:3, :3].T + plane[:3, 3]
         self.lines[role].SetAndObservePolyData(scenes._line_polydata(points_mm, lines))
 
@@ -180,6 +230,8 @@ class LiveScene:
         node.GetDisplayNode().SetAndObserveColorNodeID(colours.GetID())
         node.SetAndObserveTransformNodeID(self.transform.GetID())
         node.SetSelectable(False)
+        node.SetSaveWithScene(False)
+        node.GetDisplayNode().SetSaveWithScene(False)
         return node
 
 
@@ -259,6 +311,7 @@ def _colour_table():
     table.SetName("Predicted vessels colours")
     table.SetTypeToUser()
     table.SetHideFromEditors(True)
+    table.SetSaveWithScene(False)
     table.SetNumberOfColors(2)
     table.SetColor(0, "none", 0, 0, 0, 0)
     table.SetColor(1, "vessels", *PREDICTED_RGB, 1)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from ..geometry.camera import Camera
 from . import scene as scenes
+from .live_scene import LiveScene
 
 MICROSCOPE, THROUGH, OVERVIEW, MRI = "Microscope", "MicroscopeCamera", "MicroscopeOverview", "MicroscopeMRI"
 FIRST_LAYOUT_ID = 617  # free ids are sought from here on; Slicer's own end below 100
@@ -46,6 +48,44 @@ LAYOUT = f"""
 """
 
 
+class LiveViews:
+    """The views of the live layout. through_view: gives camera node and size (px) of the view through the camera, or
+    None while there is none; depth_node: the MRI's slice, or None."""
+
+    def __init__(self, slice_node, composite_node, through_view: Callable[[], tuple | None], depth_node=None):
+        self._slice, self._composite = slice_node, composite_node
+        self._through_view, self._depth = through_view, depth_node
+        self._fitted: tuple | None = None
+
+    def follow(self, live: LiveScene, changed: bool) -> None:
+        """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
+        size = self._slice.GetDimensions()[:2]
+        align_slice(self._slice, live.camera, live.camera_to_ras, live.plane_mm)
+        if changed or self._fitted != (size, live.camera):
+            self._fitted = (size, live.camera)
+            fit_slice(self._slice, live.camera, live.plane_mm)
+        live.set_view_pixel(view_pixel_mm(self._slice))
+        show_layers(self._composite, live.frame, live.fill, live.fill_opacity)
+        visible = live.overlay_visible
+        if bool(self._slice.GetSliceVisible()) != visible:
+            self._slice.SetSliceVisible(visible)
+        if self._depth is not None and visible:
+            align_depth_slice(self._depth, live.camera_to_ras, live.plane_mm)
+        through = self._through_view()
+        if through is not None:
+            camera_node, view_size_px = through
+            if visible:
+                aim_camera(camera_node, view_size_px, live.camera, live.camera_to_ras, live.plane_mm)
+            else:
+                look_away(camera_node)
+
+    def leave(self) -> None:
+        """Nothing of the live frame stays in the views."""
+        self._slice.SetSliceVisible(False)
+        for put in (self._composite.SetBackgroundVolumeID, self._composite.SetLabelVolumeID):
+            put(None)
+
+
 def add_layout(layout_node) -> int:
     """Make the layout known to Slicer once; returns its id."""
     layout_id = FIRST_LAYOUT_ID
@@ -75,6 +115,11 @@ def fit_slice(slice_node, camera: Camera, plane_mm: float) -> None:
     mm_per_px = max(width / max(view_width, 1), height / max(view_height, 1))
     slice_node.SetXYZOrigin(0, 0, 0)
     slice_node.SetFieldOfView(mm_per_px * view_width, mm_per_px * view_height, mm_per_px)
+
+
+def view_pixel_mm(slice_node) -> float:
+    """Size of a pixel of the slice view, mm."""
+    return slice_node.GetFieldOfView()[0] / max(slice_node.GetDimensions()[0], 1)
 
 
 def align_depth_slice(slice_node, camera_to_ras: np.ndarray, plane_mm: float) -> None:
