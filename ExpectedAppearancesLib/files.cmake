@@ -71,6 +71,19 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/registration/poses_file.py
   ExpectedAppearancesLib/registration/predictor.py
   ExpectedAppearancesLib/registration/record.py
+  ExpectedAppearancesLib/runs/__init__.py
+  ExpectedAppearancesLib/runs/closing.py
+  ExpectedAppearancesLib/runs/command_line_module.py
+  ExpectedAppearancesLib/runs/dependencies.py
+  ExpectedAppearancesLib/runs/environment.py
+  ExpectedAppearancesLib/runs/output.py
+  ExpectedAppearancesLib/runs/pip_words.py
+  ExpectedAppearancesLib/runs/processes.py
+  ExpectedAppearancesLib/runs/record.py
+  ExpectedAppearancesLib/runs/results.py
+  ExpectedAppearancesLib/runs/runner.py
+  ExpectedAppearancesLib/runs/state.py
+  ExpectedAppearancesLib/runs/system_report.py
   ExpectedAppearancesLib/textures/__init__.py
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py

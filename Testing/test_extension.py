@@ -19,6 +19,7 @@ from package_files import HEADER, LIST, library_files
 ROOT = Path(__file__).resolve().parents[1]
 MODULE = ROOT / "ExpectedAppearances" / "ExpectedAppearances.py"
 UI = ROOT / "ExpectedAppearances" / "Resources" / "UI" / "ExpectedAppearances.ui"
+CLI_FOLDERS = sorted(path.parent for path in MODULE.parent.glob("*/CMakeLists.txt"))
 SHARED_ENTRIES = ("homepage", "contributors", "description", "category", "iconurl", "screenshoturls", "depends")
 ALLOWED_IMPORTS = {"slicer", "vtk", "numpy", "qt", "ctk"} | set(sys.stdlib_module_names)
 
@@ -66,7 +67,19 @@ def test_every_file_of_the_module_is_packaged():
     listed = cmake_list(lists, "MODULE_PYTHON_SCRIPTS") + cmake_list(lists, "MODULE_PYTHON_RESOURCES")
     listed = {name.replace("${MODULE_NAME}", folder.name) for name in listed}
     paths = [path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    # A command-line module in a folder of its own has a list of its own.
+    paths = [path for path in paths if path.parent not in CLI_FOLDERS]
     assert listed == {path.relative_to(folder).as_posix() for path in paths} - {"CMakeLists.txt"}
+
+
+def test_every_command_line_module_is_built():
+    lists = (MODULE.parent / "CMakeLists.txt").read_text(encoding="utf-8")
+    assert CLI_FOLDERS and re.findall(r"add_subdirectory\((\w+)\)", lists) == [f.name for f in CLI_FOLDERS]
+    for folder in CLI_FOLDERS:
+        own = (folder / "CMakeLists.txt").read_text(encoding="utf-8")
+        assert f"set(MODULE_NAME {folder.name})" in own and "SlicerMacroBuildScriptedCLI(" in own
+        files = {path.name for path in folder.iterdir() if path.is_file()}
+        assert files == {"CMakeLists.txt", f"{folder.name}.py", f"{folder.name}.xml"}
 
 
 def test_descriptions_agree():
