@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -12,7 +12,9 @@ from ..case.case import Case
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..registration.poses_file import read_poses
-from ..registration.predictor import Prediction, Predictor
+
+if TYPE_CHECKING:
+    from ..registration.predictor import Prediction
 
 PROVIDER_NAMES = {"CUDAExecutionProvider": "GPU (CUDA)", "CPUExecutionProvider": "CPU"}
 THREADS = 2
@@ -46,6 +48,8 @@ def open_model(case: Case) -> OpenedModel:
             f"onnxruntime, which runs the model, cannot be loaded ({error}); install it: the panel offers to, or give "
             "slicer.util.pip_install('onnxruntime') in the Python console."
         ) from error
+    from ..registration.predictor import Predictor
+
     estimator = Predictor(case.model_folder, THREADS)
     trained_on = estimator.meta.get("vessels_sha256")
     if trained_on and trained_on != case_key(case):
@@ -71,6 +75,8 @@ def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path,
 
     Raises InputError with every problem of the file.
     """
+    from ..registration.predictor import Prediction
+
     camera, frames = read_poses(poses_path)
     given = {
         frame.image: Prediction(

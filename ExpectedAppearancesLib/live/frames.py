@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from ..errors import InputError
 from ..geometry.camera import Camera
-from ..registration.predictor import ASPECT_TOLERANCE, Prediction
+
+if TYPE_CHECKING:  # at run time it would load OpenCV, which the panel offers to install
+    from ..registration.predictor import Prediction
 
 SMALLEST_PX = 32
 BLACK = 24  # of 255; borders of recorded video are not quite 0
@@ -56,6 +58,8 @@ class FramePreparation:
 
     def prepare(self, image: np.ndarray) -> tuple[np.ndarray, Camera]:
         """uint8 RGB (H, W, 3) without distortion, and the camera that took it. Raises InputError for no picture."""
+        import cv2
+
         image = checked_rgb(image)
         if self._settings.flip_rows:
             image = image[::-1]
@@ -97,6 +101,8 @@ class FramePreparation:
         )
 
     def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        import cv2
+
         if camera not in self._maps:
             size = (camera.width, camera.height)
             maps = cv2.initUndistortRectifyMap(
@@ -151,4 +157,6 @@ def _union(first: tuple, second: tuple) -> tuple[int, int, int, int]:
 
 
 def _same_aspect(camera: Camera, width: int, height: int) -> bool:
+    from ..registration.predictor import ASPECT_TOLERANCE
+
     return abs(width * camera.height / (height * camera.width) - 1) <= ASPECT_TOLERANCE

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from .. import files
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.pose import is_rigid
-from ..registration.poses_file import write_poses
-from ..registration.predictor import Prediction
-from ..registration.record import frame_record
+from ..registration.poses_file import read_poses, write_poses
+
+if TYPE_CHECKING:
+    from ..registration.predictor import Prediction
 
 FORMAT = "ExpectedAppearances live frame"
 
@@ -53,6 +55,8 @@ def to_note(frame: RecordedFrame, case_key: str) -> str:
 
 def from_note(text: str) -> tuple[RecordedFrame, str]:
     """The frame without its pixels, and the key of its case. Raises InputError for anything else."""
+    from ..registration.predictor import Prediction
+
     try:
         values = json.loads(text)
         if values["format"] != FORMAT:
@@ -79,6 +83,8 @@ def export_recording(folder: Path, frames: Iterable[RecordedFrame]) -> Path:
     Raises InputError when there is no frame, when the camera changes (one poses.json has one camera), or on a full
     disk.
     """
+    from ..registration.record import frame_record
+
     folder = Path(folder)
     entries, camera = [], None
     for number, frame in enumerate(frames):
@@ -104,8 +110,6 @@ def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray)
 
     Raises InputError when the file has another camera, or is damaged.
     """
-    from ..registration.poses_file import read_poses
-
     path = Path(folder) / "poses.json"
     entries = []
     if path.is_file():

@@ -10,13 +10,13 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..case.case import Case
 from ..errors import ExpectedAppearancesError
 from ..geometry.camera import Camera
-from ..registration.predictor import Prediction
 from .estimator import Estimator, case_key
 from .feed import Feed, FeedState, FeedStatus
 from .frames import FramePreparation, FrameSettings, LiveFrame
@@ -24,6 +24,9 @@ from .overlay import Overlay, OverlayMaker
 from .sources import Source
 from .trust import Shown, Sight, Verdict, judge
 from .worker import NewestWins, WorkerCounts
+
+if TYPE_CHECKING:
+    from ..registration.predictor import Prediction
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,14 +10,15 @@ import re
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import cv2
 import numpy as np
 
 from ..errors import ExpectedAppearancesError, InputError
-from ..registration.predictor import Prediction
 from .frames import LiveFrame
+
+if TYPE_CHECKING:
+    from ..registration.predictor import Prediction
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".mpg", ".mpeg", ".wmv", ".m4v")
@@ -161,6 +162,8 @@ class VideoFile:
     def open(self) -> None:
         if not self._path.is_file():
             raise SourceLost(f"{self._path}: video not found; check the path, or wait for its drive to return.")
+        import cv2
+
         self._capture = cv2.VideoCapture(str(self._path))
         if not self._capture.isOpened():
             self.close()
@@ -204,15 +207,17 @@ class VideoFile:
 class CaptureDevice:
     """A camera or frame grabber by its number, or the address of a network stream; the newest frame each time."""
 
-    def __init__(self, device: int | str, clock: Callable[[], float] = time.monotonic, capture=cv2.VideoCapture):
-        self._device, self._clock, self._make_capture = device, clock, capture
+    def __init__(self, device: int | str, clock: Callable[[], float] = time.monotonic):
+        self._device, self._clock = device, clock
         self.dropped = 0
         self.can_wait = False
         self._number = 0
         self._capture = None
 
     def open(self) -> None:
-        self._capture = self._make_capture(self._device)
+        import cv2
+
+        self._capture = cv2.VideoCapture(self._device)
         if not self._capture.isOpened():
             self.close()
             raise SourceLost(
@@ -254,6 +259,8 @@ def _has_its_end(data: bytes, suffix: str) -> bool | None:
 
 
 def _decoded(data: bytes, path: Path) -> np.ndarray:
+    import cv2
+
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
         raise InputError(f"{path}: not an image that can be read (or damaged); it is left out.")

@@ -176,6 +176,10 @@ class LiveController:
         if self._session is not None:
             self._session.stale_s = stale_s
 
+    def fit_views(self) -> None:
+        """Show the whole frame again."""
+        self._follow(True)
+
     def set_options(self, options: OverlayOptions) -> None:
         self.options = options
         if self.live is not None:

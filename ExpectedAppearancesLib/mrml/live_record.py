@@ -14,7 +14,6 @@ from ..errors import InputError
 from ..geometry.pose import camera_to_ras
 from ..live.recording import RecordedFrame, export_recording, from_note, to_note
 from ..live.session import LiveResult
-from ..registration.predictor import Prediction
 from . import scene as scenes
 from .live_scene import FRAME, ROLE_ATTRIBUTE, TRANSFORM, LiveScene, node_of_role
 from .live_stream import pixels_of
@@ -53,6 +52,8 @@ class Recorder:
 
     def add(self, result: LiveResult) -> bool:
         """Append a result that is shown in the live scene. False when it has no picture, or the limit is reached."""
+        from ..registration.predictor import Prediction
+
         if result.image_rgb is None or self.full:
             return False
         if self._begin_s is None:
@@ -165,8 +166,6 @@ def _sequence(browser, role: str):
     collection.UnRegister(None)
     for i in range(collection.GetNumberOfItems()):
         node = collection.GetItemAsObject(i)
-        if node.GetAttribute(SEQUENCE_ATTRIBUTE) == role and browser.IsSynchronizedSequenceNodeID(
-            node.GetID(), True
-        ):
+        if node.GetAttribute(SEQUENCE_ATTRIBUTE) == role and browser.IsSynchronizedSequenceNodeID(node.GetID(), True):
             return node
     raise InputError(f"{browser.GetName()}: is no recording of this panel; choose one that was recorded here.")

@@ -128,7 +128,9 @@ class AlignSection:
         if difference is None:
             self._set(self._ui.differenceLabel, "")
             return
-        text = _("Predicted (blue) from true (green): ADD {add} mm, reprojection {px} px, rotation {deg}°, shift {mm} mm")
+        text = _(
+            "Predicted (blue) from true (green): ADD {add} mm, reprojection {px} px, rotation {deg}°, shift {mm} mm"
+        )
         self._set(
             self._ui.differenceLabel,
             text.format(

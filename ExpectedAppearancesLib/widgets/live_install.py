@@ -1,23 +1,22 @@
-"""What registration needs besides Slicer, and installing it after asking."""
+"""What registration needs besides Slicer, and installing it after asking, from the Internet or a folder of wheels."""
 
 from __future__ import annotations
 
-import importlib.util
+from pathlib import Path
 
+import qt
 import slicer
 from slicer.i18n import tr as _
 
-REQUIRED = {"onnxruntime": "onnxruntime", "cv2": "opencv-python-headless"}
+from ..errors import ExpectedAppearancesError
+from ..runs import dependencies
 
-
-def missing() -> list[str]:
-    """Packages that are not installed, by the names that pip knows; nothing is imported."""
-    return [package for module, package in REQUIRED.items() if importlib.util.find_spec(module) is None]
+KIND = "registration"
 
 
 def problem() -> str:
-    """What is missing, in words, or ''."""
-    packages = missing()
+    """What is missing, in words, or ''. Looks at the disk: not for every tick."""
+    packages = dependencies.missing(KIND)
     if not packages:
         return ""
     return _("This Slicer lacks {packages}; install it with the button below.").format(packages=", ".join(packages))
@@ -25,20 +24,33 @@ def problem() -> str:
 
 def install(say) -> bool:
     """Ask, then install. False when the user declined or it failed; `say` is told why."""
-    packages = missing()
-    if not packages:
-        return True
-    question = _("{packages} will be installed into this Slicer from the Internet. Go on?")
-    if not slicer.util.confirmOkCancelDisplay(question.format(packages=", ".join(packages))):
+    chosen = _ask()
+    if chosen is None:
         return False
+    slicer.app.setOverrideCursor(qt.Qt.WaitCursor)
     try:
-        slicer.util.pip_install(packages)
-    except Exception as error:  # pip's own failure: its output is in Slicer's log
-        say(
-            _(
-                "{packages} could not be installed ({error}). Without Internet, install from a folder of wheels in the "
-                "Python console: slicer.util.pip_install('--no-index --find-links FOLDER {packages}')."
-            ).format(packages=" ".join(packages), error=error)
-        )
+        return dependencies.install(KIND, chosen or None, lambda _packages: True, say)
+    except ExpectedAppearancesError as error:
+        say(str(error))
         return False
-    return not missing()
+    finally:
+        slicer.app.restoreOverrideCursor()
+
+
+def _ask():
+    """Path of a folder of wheels, '' for the Internet, None when the user declines."""
+    box = qt.QMessageBox(slicer.util.mainWindow())
+    box.setWindowTitle(_("Install what registration needs"))
+    box.setText(
+        _("{packages} will be installed into this Slicer.").format(packages=", ".join(dependencies.missing(KIND)))
+    )
+    internet = box.addButton(_("From the Internet"), qt.QMessageBox.AcceptRole)
+    wheels = box.addButton(_("From a folder of wheels..."), qt.QMessageBox.ActionRole)
+    box.addButton(qt.QMessageBox.Cancel)
+    box.exec_()
+    if box.clickedButton() == internet:
+        return ""
+    if box.clickedButton() != wheels:
+        return None
+    folder = qt.QFileDialog.getExistingDirectory(slicer.util.mainWindow(), _("Folder of wheels (*.whl)"))
+    return Path(folder) if folder else None

@@ -32,6 +32,7 @@ class LivePanel:
         self._gui_tag = None
         self._message = ""
         self._problem = ""
+        self._missing = live_install.problem()
         self._ticks = 0
         self.layout = LayoutSection()
         self.status = StatusSection(ui)
@@ -89,8 +90,10 @@ class LivePanel:
         if p is None:
             return
         self.source.refresh(self.controller.running)
-        self._problem = live_install.problem() or self.source.problem()
-        self.ui.installButton.visible = bool(live_install.problem())
+        if self._missing:
+            self._missing = live_install.problem()
+        self._problem = self._missing or self.source.problem()
+        self.ui.installButton.visible = bool(self._missing)
         self.controller.set_stale(p.staleMs / 1000)
         options = OverlayOptions(p.outline, p.fill, p.fillOpacity, p.box)
         if options != self.controller.options:
