@@ -51,8 +51,8 @@ def pose_from_landmarks(points_px: np.ndarray, points_world_mm: np.ndarray, came
     """
     import cv2
 
-    points_px = np.asarray(points_px, float).reshape(-1, 2)
-    points_mm = np.asarray(points_world_mm, float).reshape(-1, 3)
+    points_px = np.ascontiguousarray(points_px, float).reshape(-1, 2)  # OpenCV takes no other
+    points_mm = np.ascontiguousarray(points_world_mm, float).reshape(-1, 3)
     count = len(points_px)
     if count != len(points_mm):
         raise InputError(

@@ -69,7 +69,8 @@ def judge(
 
     shown: the frame on the screen. case_key: of the case that is open. stale_s: age from which a frame is too old.
     """
-    age_s = math.nan if shown is None else max(0.0, now_s - shown.taken_s)
+    age_s = math.nan if shown is None else now_s - shown.taken_s
+    age_s = 0.0 if age_s < 0 else age_s  # NaN stays NaN: what has no time is not new
     if failure:
         return Verdict(Sight.FAILED, age_s, failure)
     if shown is not None and shown.case_key != case_key:

@@ -9,7 +9,7 @@ KINDS = (SourceKind.PATH, SourceKind.DEVICE, SourceKind.NODE)
 
 
 class SourceSection:
-    """parameters: callable that gives the parameter node, or None while there is none. changed: called after a change."""
+    """parameters: callable that gives the parameter node, or None. changed: called after the user changed something."""
 
     def __init__(self, ui, parameters, changed):
         self._ui, self._parameters, self._changed = ui, parameters, changed
