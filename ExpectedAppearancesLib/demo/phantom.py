@@ -28,7 +28,7 @@ MIDDLE, GAIN = 0.55, 0.33  # colour = MIDDLE + GAIN x coordinate / scale, 0..1
 VESSEL_RGB = (0.42, 0.0, 0.05)  # green 0: the network takes no point from vessels
 BACKGROUND_RGB = (0.0, 0.0, 0.0)
 SIZE_PX = 128
-DISTANCE_MM = 160.0
+CLOSENESS = 0.67  # of the distance from which all vessels fit into the view
 CAMERA = Camera(640, 480, 1900.0, 1900.0, 331.0, 226.0)
 SAMPLE_FRAMES = 90
 COVERED = range(50, 62)  # of the sample's frames: a hand is in the way
@@ -84,13 +84,14 @@ class Phantom:
     def pose(self, phase: float) -> np.ndarray:
         """camera_from_world on a closed path over the craniotomy, phase 0..1; never twice the same view."""
         craniotomy = find_craniotomy(self.case.vessels, self.case.cortex, self.case.space)
+        distance_mm = _distance_mm(self.case)
         across = np.cross(craniotomy.up, craniotomy.outward_axis)
         angle = 2 * np.pi * phase
         tilt = 0.30 + 0.12 * np.sin(3 * angle)
         away = np.cos(tilt) * craniotomy.outward_axis
         away = away + np.sin(tilt) * (np.cos(angle) * across + np.sin(angle) * craniotomy.up)
         target = craniotomy.centre_world_mm + 3.0 * np.sin(2 * angle) * across + 2.0 * np.cos(angle) * craniotomy.up
-        centre = target + away * DISTANCE_MM * (1 + 0.08 * np.sin(2 * angle + 1))
+        centre = target + away * distance_mm * (1 + 0.08 * np.sin(2 * angle + 1))
         return look_at(centre, target, craniotomy.up + 0.4 * np.sin(angle) * across)
 
 
@@ -107,8 +108,14 @@ def make_phantom(folder: Path, seed: int = 0) -> Phantom:
             case = Case.create(folder, parts / "vessels.vtp", parts / "cortex.vtp", CAMERA)
         finally:
             shutil.rmtree(parts, ignore_errors=True)
-        _write_model(case)
+        return as_phantom(case)
     case = Case.open(folder)
+    return Phantom(case, _encoding(case))
+
+
+def as_phantom(case: Case) -> Phantom:
+    """Give a case with a cortex the phantom's model."""
+    _write_model(case)
     return Phantom(case, _encoding(case))
 
 
@@ -146,12 +153,12 @@ def covered_frame(number: int, camera: Camera = CAMERA) -> np.ndarray:
 class PhantomPainter:
     """Draws frames of the phantom off-screen for `camera`. Close it, or use it as a context manager."""
 
-    def __init__(self, phantom: Phantom, camera: Camera = CAMERA):
+    def __init__(self, phantom: Phantom, camera: Camera | None = None):
         import vtk
 
         from ..masks.renderer import offscreen_window
 
-        self._camera = camera.without_distortion()
+        camera = self._camera = (camera or phantom.case.camera).without_distortion()
         self._case = phantom.case
         self._pixels = vtk.vtkUnsignedCharArray()
         self._window = offscreen_window(camera.width, camera.height)
@@ -169,7 +176,8 @@ class PhantomPainter:
 
         camera = self._camera
         depth_mm = transform(camera_from_world, self._case.vessels.centroid_mm[None])[0, 2]
-        near, far = max(depth_mm - 60, 1.0), depth_mm + 60
+        reach_mm = 3 * self._case.vessels.radius_mm
+        near, far = max(depth_mm - reach_mm, 1.0), depth_mm + reach_mm
         apply_to_vtk_camera(self._renderer.GetActiveCamera(), camera, camera_from_world, near, far)
         self._window.Render()
         self._window.GetPixelData(0, 0, camera.width - 1, camera.height - 1, 0, self._pixels, 0)
@@ -199,9 +207,13 @@ class PhantomPainter:
         self._renderer.AddActor(actor)
 
 
+def _distance_mm(case: Case) -> float:
+    return CLOSENESS * 2 * case.vessels.radius_mm / case.camera.field_of_view_mm(1.0)
+
+
 def _encoding(case: Case) -> PoseEncoding:
     centre, scale = case.vessels.centroid_mm, case.vessels.radius_mm
-    return PoseEncoding(np.eye(3), centre, scale, np.array([0.0, 0.0, DISTANCE_MM]), scale)
+    return PoseEncoding(np.eye(3), centre, scale, np.array([0.0, 0.0, _distance_mm(case)]), scale)
 
 
 def _write_model(case: Case) -> None:
@@ -218,13 +230,13 @@ def _write_model(case: Case) -> None:
         "estimator": "dense",
         "preset": "phantom",
         "size_px": SIZE_PX,
-        "camera": CAMERA.to_dict(),
+        "camera": case.camera.to_dict(),
         "encoding": _encoding(case).to_dict(),
         "plausible_view": {
             "centre_world_mm": case.vessels.centroid_mm.tolist(),
             "outward_axis": craniotomy.outward_axis.tolist(),
             "tilt_max_deg": 60.0,
-            "distance_mm": [0.6 * DISTANCE_MM, 1.6 * DISTANCE_MM],
+            "distance_mm": [0.6 * _distance_mm(case), 1.6 * _distance_mm(case)],
         },
         "confidence": confidence.to_dict(),
         "vessels_sha256": case.manifest["inputs"]["vessels"]["sha256"],

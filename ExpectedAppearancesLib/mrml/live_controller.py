@@ -71,6 +71,7 @@ class LiveController:
         self.alignment: Alignment | None = None
         self.truth: np.ndarray | None = None
         self.status = IDLE
+        self.shown_in_ms = 0.0  # how long the GUI thread was held to put the last frame into the scene
         self._session: LiveSession | None = None
         self._stream: NodeFrames | None = None
         self._model: OpenedModel | None = None
@@ -196,6 +197,7 @@ class LiveController:
         if self._stream is not None:
             self._session.say_source(self._stream.look())
         update = self._session.tick(wait_s)
+        begin = time.perf_counter()
         changed = False
         if update.new is not None:
             self._forget_truth()
@@ -212,6 +214,8 @@ class LiveController:
         if self.alignment is not None:
             self.show_truth(self.alignment.camera_from_world)
         self.status = self._status(update)
+        if update.new is not None:
+            self.shown_in_ms = (time.perf_counter() - begin) * 1000
         return self.status
 
     # -------------------------------------------------------------------------------------------------------- truth
