@@ -17,6 +17,8 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py
+  ExpectedAppearancesLib/case/recorded.py
+  ExpectedAppearancesLib/case/steps.py
   ExpectedAppearancesLib/cli/__init__.py
   ExpectedAppearancesLib/cli/check.py
   ExpectedAppearancesLib/cli/demo.py
@@ -41,6 +43,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/metrics.py
   ExpectedAppearancesLib/evaluation/overlays.py
   ExpectedAppearancesLib/evaluation/report.py
+  ExpectedAppearancesLib/evaluation/verdict.py
   ExpectedAppearancesLib/files.py
   ExpectedAppearancesLib/geometry/__init__.py
   ExpectedAppearancesLib/geometry/camera.py
@@ -73,6 +76,8 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/model/training.py
   ExpectedAppearancesLib/model/views.py
   ExpectedAppearancesLib/mrml/__init__.py
+  ExpectedAppearancesLib/mrml/charts.py
+  ExpectedAppearancesLib/mrml/labelling.py
   ExpectedAppearancesLib/mrml/live_align.py
   ExpectedAppearancesLib/mrml/live_banner.py
   ExpectedAppearancesLib/mrml/live_controller.py
@@ -80,6 +85,9 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/live_scene.py
   ExpectedAppearancesLib/mrml/live_stream.py
   ExpectedAppearancesLib/mrml/live_views.py
+  ExpectedAppearancesLib/mrml/planning.py
+  ExpectedAppearancesLib/mrml/planning_adopt.py
+  ExpectedAppearancesLib/mrml/planning_session.py
   ExpectedAppearancesLib/mrml/scene.py
   ExpectedAppearancesLib/poses/__init__.py
   ExpectedAppearancesLib/poses/craniotomy.py
@@ -108,6 +116,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
+  ExpectedAppearancesLib/textures/proposal.py
   ExpectedAppearancesLib/widgets/__init__.py
   ExpectedAppearancesLib/widgets/live_align.py
   ExpectedAppearancesLib/widgets/live_install.py
@@ -119,6 +128,20 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/widgets/live_source.py
   ExpectedAppearancesLib/widgets/live_status.py
   ExpectedAppearancesLib/widgets/live_texts.py
+  ExpectedAppearancesLib/widgets/planning_appearances.py
+  ExpectedAppearancesLib/widgets/planning_case.py
+  ExpectedAppearancesLib/widgets/planning_devices.py
+  ExpectedAppearancesLib/widgets/planning_help.py
+  ExpectedAppearancesLib/widgets/planning_labelling.py
+  ExpectedAppearancesLib/widgets/planning_panel.py
+  ExpectedAppearancesLib/widgets/planning_poses.py
+  ExpectedAppearancesLib/widgets/planning_qt.py
+  ExpectedAppearancesLib/widgets/planning_run.py
+  ExpectedAppearancesLib/widgets/planning_section.py
+  ExpectedAppearancesLib/widgets/planning_selftest.py
+  ExpectedAppearancesLib/widgets/planning_textures.py
+  ExpectedAppearancesLib/widgets/planning_training.py
+  ExpectedAppearancesLib/widgets/planning_validation.py
   )
 set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md

@@ -60,6 +60,7 @@ def train_case(
     poses = np.stack([sampler_of(case, seed + 1).sample(i) for i in range(400)])
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
     trainer = _Trainer(case, preset, encoding, device, seed, views)
+    made_from = files.sha256(folder_of(case, method) / "index.json")
     progress(0.0, "rendering validation views")
     validation = draw_views(case.folder, validation_views, preset.validation_views)
     case.record("train", preset=preset.to_dict(), seed=seed, styles=trained_on, held_out_styles=held_out, done=False)
@@ -74,6 +75,7 @@ def train_case(
         done=True,
         validation=figures,
         method=method,
+        appearances_sha256=made_from,
         model_sha256=files.sha256(case.model_folder / "model.onnx"),
     )
     return figures

@@ -20,6 +20,7 @@ from xml.sax.saxutils import escape
 from .. import cli
 from ..cli.progress import Progress, duration
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, CancelledError, InputError
+from .environment import MODULES
 from .output import EXIT_PREFIX, FIGURES_PREFIX
 
 # A run of hours reports less and less often, so that its log stays small.
@@ -42,6 +43,8 @@ def command_arguments(command: str, arguments: Sequence[str]) -> list[str]:
     Slicer passes every number and choice, whether one was given or not: 0, 'auto' and the folder '.' stand for "left
     out" where the command's default is to be left out. A list arrives as one text with commas.
     """
+    if command not in MODULES:
+        return list(arguments)  # no module of Slicer, so never called by its panel: 0 means 0
     options = {flag: action for action in parser_of(command)._actions for flag in action.option_strings}
     positional, rest = [], []
     i = 0
