@@ -2,12 +2,13 @@
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import slicer
 import vtk
 from slicer.i18n import tr as _
 from slicer.i18n import translate
-from slicer.parameterNodeWrapper import parameterNodeWrapper
+from slicer.parameterNodeWrapper import WithinRange, parameterNodeWrapper
 from slicer.ScriptedLoadableModule import (
     ScriptedLoadableModule,
     ScriptedLoadableModuleLogic,
@@ -90,15 +91,15 @@ class ExpectedAppearancesLiveParameterNode:
     flipRows: bool = False
     repeat: bool = False
     onlyNew: bool = False
-    rateHz: float = 25.0
-    longestPx: int = 1280
-    staleMs: int = 500
+    rateHz: Annotated[float, WithinRange(0.1, 100)] = 25.0
+    longestPx: Annotated[int, WithinRange(256, 4096)] = 1280
+    staleMs: Annotated[int, WithinRange(50, 60000)] = 500
     outline: bool = True
     fill: bool = True
-    fillOpacity: float = 0.35
+    fillOpacity: Annotated[float, WithinRange(0, 1)] = 0.35
     box: bool = False
     mriVolume: slicer.vtkMRMLScalarVolumeNode
-    limitMb: int = 2048
+    limitMb: Annotated[int, WithinRange(64, 65536)] = 2048
     browser: slicer.vtkMRMLNode
 
 

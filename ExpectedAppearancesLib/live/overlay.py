@@ -48,7 +48,7 @@ class OverlayMaker:
         low, high = vessels.vertices_mm.min(axis=0), vessels.vertices_mm.max(axis=0)
         sides = list(itertools.product((0, 1), repeat=3))
         self._corners_mm = np.where(sides, high, low)
-        self._sides = np.array([(i, j) for i, j in itertools.combinations(range(8), 2) if (i ^ j).bit_count() == 1])
+        self._sides = np.array([(i, j) for i, j in itertools.combinations(range(8), 2) if bin(i ^ j).count("1") == 1])
 
     def make(self, camera: Camera, camera_from_world: np.ndarray) -> Overlay | None:
         """Overlay of a frame of `camera` (without distortion); None when no vessel lies in front of the camera."""

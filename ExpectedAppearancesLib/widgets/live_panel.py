@@ -90,6 +90,7 @@ class LivePanel:
         if p is None:
             return
         self.source.refresh(self.controller.running)
+        self.record.refresh()
         if self._missing:
             self._missing = live_install.problem()
         self._problem = self._missing or self.source.problem()

@@ -18,6 +18,7 @@ class RecordSection:
     def __init__(self, ui, controller: LiveController, parameters, say):
         self._ui, self._controller, self._parameters, self._say = ui, controller, parameters, say
         ui.recordButton.connect("toggled(bool)", self._on_record)
+        ui.browserComboBox.connect("currentNodeChanged(vtkMRMLNode*)", self._on_browser)
         ui.replaySlider.connect("valueChanged(int)", self._on_slider)
         ui.exportButton.connect("clicked(bool)", lambda _checked=False: self._on_export())
 
@@ -70,6 +71,17 @@ class RecordSection:
         p = self._parameters()
         chosen = p.browser if p is not None else None
         return chosen if chosen is not None and chosen.GetAttribute(live_record.BROWSER_ATTRIBUTE) else None
+
+    def refresh(self) -> None:
+        """From the parameter node to the widget."""
+        p = self._parameters()
+        if p is not None and self._ui.browserComboBox.currentNode() is not p.browser:
+            self._ui.browserComboBox.setCurrentNode(p.browser)
+
+    def _on_browser(self, node) -> None:
+        p = self._parameters()
+        if p is not None and p.browser is not node:
+            p.browser = node
 
     def _on_record(self, checked: bool) -> None:
         try:

@@ -17,6 +17,8 @@ class SourceSection:
         self._paths["cameraPath"] = ui.cameraPathLineEdit
         for name, edit in self._paths.items():
             edit.connect("currentPathChanged(QString)", lambda path, n=name: self._on_path(n, path))
+        # Slicer's own binding allows one class of node only, and no abstract one.
+        ui.sourceNodeComboBox.connect("currentNodeChanged(vtkMRMLNode*)", self._on_node)
         ui.kindComboBox.connect("currentIndexChanged(int)", self._on_kind)
 
     def choice(self) -> Choice:
@@ -49,6 +51,8 @@ class SourceSection:
                 was_blocked = edit.blockSignals(True)
                 edit.currentPath = getattr(p, name)
                 edit.blockSignals(was_blocked)
+        if ui.sourceNodeComboBox.currentNode() is not p.sourceNode:
+            ui.sourceNodeComboBox.setCurrentNode(p.sourceNode)
         kind = SourceKind(p.sourceKind)
         if ui.kindComboBox.currentIndex != KINDS.index(kind):
             was_blocked = ui.kindComboBox.blockSignals(True)
@@ -69,6 +73,12 @@ class SourceSection:
         p = self._parameters()
         if p is not None and getattr(p, name) != path:
             setattr(p, name, path)
+            self._changed()
+
+    def _on_node(self, node) -> None:
+        p = self._parameters()
+        if p is not None and p.sourceNode is not node:
+            p.sourceNode = node
             self._changed()
 
     def _on_kind(self, index: int) -> None:
