@@ -42,6 +42,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/cli/train.py
   ExpectedAppearancesLib/demo/__init__.py
   ExpectedAppearancesLib/demo/frames.py
+  ExpectedAppearancesLib/demo/phantom.py
   ExpectedAppearancesLib/demo/pipeline.py
   ExpectedAppearancesLib/demo/vessel_tree.py
   ExpectedAppearancesLib/devices.py
@@ -66,6 +67,18 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/geometry/pose.py
   ExpectedAppearancesLib/geometry/se3.py
   ExpectedAppearancesLib/geometry/silhouette.py
+  ExpectedAppearancesLib/live/__init__.py
+  ExpectedAppearancesLib/live/alignment.py
+  ExpectedAppearancesLib/live/choice.py
+  ExpectedAppearancesLib/live/estimator.py
+  ExpectedAppearancesLib/live/feed.py
+  ExpectedAppearancesLib/live/frames.py
+  ExpectedAppearancesLib/live/overlay.py
+  ExpectedAppearancesLib/live/recording.py
+  ExpectedAppearancesLib/live/session.py
+  ExpectedAppearancesLib/live/sources.py
+  ExpectedAppearancesLib/live/trust.py
+  ExpectedAppearancesLib/live/worker.py
   ExpectedAppearancesLib/masks/__init__.py
   ExpectedAppearancesLib/masks/exposed.py
   ExpectedAppearancesLib/masks/labels.py
@@ -85,6 +98,13 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/__init__.py
   ExpectedAppearancesLib/mrml/charts.py
   ExpectedAppearancesLib/mrml/labelling.py
+  ExpectedAppearancesLib/mrml/live_align.py
+  ExpectedAppearancesLib/mrml/live_banner.py
+  ExpectedAppearancesLib/mrml/live_controller.py
+  ExpectedAppearancesLib/mrml/live_record.py
+  ExpectedAppearancesLib/mrml/live_scene.py
+  ExpectedAppearancesLib/mrml/live_stream.py
+  ExpectedAppearancesLib/mrml/live_views.py
   ExpectedAppearancesLib/mrml/planning.py
   ExpectedAppearancesLib/mrml/planning_adopt.py
   ExpectedAppearancesLib/mrml/planning_session.py
@@ -122,6 +142,16 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/painting.py
   ExpectedAppearancesLib/textures/proposal.py
   ExpectedAppearancesLib/widgets/__init__.py
+  ExpectedAppearancesLib/widgets/live_align.py
+  ExpectedAppearancesLib/widgets/live_install.py
+  ExpectedAppearancesLib/widgets/live_layout.py
+  ExpectedAppearancesLib/widgets/live_panel.py
+  ExpectedAppearancesLib/widgets/live_record.py
+  ExpectedAppearancesLib/widgets/live_sample.py
+  ExpectedAppearancesLib/widgets/live_selftest.py
+  ExpectedAppearancesLib/widgets/live_source.py
+  ExpectedAppearancesLib/widgets/live_status.py
+  ExpectedAppearancesLib/widgets/live_texts.py
   ExpectedAppearancesLib/widgets/planning_appearances.py
   ExpectedAppearancesLib/widgets/planning_case.py
   ExpectedAppearancesLib/widgets/planning_devices.py
@@ -140,6 +170,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
 set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md
   ExpectedAppearancesLib/appearances/weights/vgg16_imagenet_to_conv5_1_fp16.safetensors
+  ExpectedAppearancesLib/demo/phantom.onnx
   ExpectedAppearancesLib/textures/generated/apricot.labels.png
   ExpectedAppearancesLib/textures/generated/apricot.png
   ExpectedAppearancesLib/textures/generated/blush.labels.png
