@@ -66,7 +66,9 @@ class ShiftedPredictor:
     def predict(self, image_rgb, _camera):
         frame = self.frames[int(image_rgb[0, 0, 0])]
         pose = pose_from_rotation(np.eye(3), (SHIFT_MM[frame.style], 0, 0)) @ frame.camera_from_world
-        return SimpleNamespace(camera_from_world=pose, accepted=frame.style != "c", confidence=0.5, latency_ms=7.0)
+        return SimpleNamespace(
+            camera_from_world=pose, accepted=frame.style != "c", confidence=0.5, covariance=None, latency_ms=7.0
+        )
 
 
 def make_case(folder: Path, styles: str = "abc") -> tuple[Path, Path]:

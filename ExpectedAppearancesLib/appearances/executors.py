@@ -16,7 +16,7 @@ _ADDRESS = re.compile(r"dask://(?P<host>\[[0-9a-fA-F:]+\]|[^/:\s]+):(?P<port>\d{
 POLL_S = 1.0
 CONNECT_S = 15
 
-OnProgress = Callable[[float, str], None]  # images done (with fractions), name of the shard
+OnProgress = Callable[[float, str], None]  # images done (with fractions), what is made
 
 
 def check_executor(executor: str) -> None:
@@ -49,9 +49,10 @@ def _run_here(shards: list[Shard], recipe: Recipe, on_progress: OnProgress) -> N
         for shard in waiting:
             missing = len(shard.items) - len(shard.finished())
             before = done + len(shard.items) - missing
-            on_progress(before, shard.name)
+            name = f"texture {shard.texture.name}"
+            on_progress(before, name)
             try:
-                made = work_on(shard, recipe, lambda n, shard=shard, before=before: on_progress(before + n, shard.name))
+                made = work_on(shard, recipe, lambda n, name=name, before=before: on_progress(before + n, name))
             except ClaimLost:
                 made = None
             if made is None:
@@ -59,7 +60,7 @@ def _run_here(shards: list[Shard], recipe: Recipe, on_progress: OnProgress) -> N
             else:
                 done += len(shard.items)
         if held:
-            on_progress(done, held[0].name)
+            on_progress(done, f"texture {held[0].texture.name}")
             time.sleep(POLL_S)
         waiting = held
 
