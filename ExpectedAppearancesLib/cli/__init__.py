@@ -35,6 +35,7 @@ COMMANDS = {
     "train": (".train", "train the pose network on the expected appearances"),
     "register": (".register", "find the pose of microscope frames"),
     "evaluate": (".evaluate", "measure predicted poses against known ones"),
+    "study": (".study", "leave-one-texture-out, number of textures, rivals and robustness, in one report"),
     "check": (".check", "report versions, devices, memory, rendering and weights, for a support request"),
 }
 # Errors of the system that mean: choose another folder or make room.

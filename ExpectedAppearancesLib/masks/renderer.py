@@ -99,14 +99,16 @@ class MaskRenderer:
             labels = self._read_labels()
             height, width = labels.shape
             self._window.GetZbufferData(0, 0, width - 1, height - 1, self._depths)
+        import cv2  # not at the top: label maps alone are drawn where it is not installed
+
         z = vtk_to_numpy(self._depths).reshape(height, width)[::-1]
-        seen = labels != BACKGROUND
-        depth_mm = np.where(
-            seen, np.float32(far * near) / (np.float32(far) - z * np.float32(far - near)), np.float32(0)
-        )
-        world_from_camera = inverse(np.asarray(camera_from_world, float)).astype(np.float32)
-        points = transform(world_from_camera, self._rays * depth_mm[..., None])
-        points[~seen] = 0
+        nothing = labels == BACKGROUND
+        depth_mm = np.float32(far * near) / (np.float32(far) - z * np.float32(far - near))
+        depth_mm[nothing] = 0
+        world_from_camera = inverse(np.asarray(camera_from_world, float))
+        # Single precision is good for a micrometre here, and many times faster.
+        points = cv2.transform(self._rays * depth_mm[..., None], world_from_camera[:3].astype(np.float32))
+        points[nothing] = 0
         return labels, depth_mm, points
 
     def close(self) -> None:
