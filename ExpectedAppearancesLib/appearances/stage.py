@@ -64,6 +64,9 @@ def synthesize_case(
         "circular_field": case.manifest["stages"].get("render", {}).get("circular_field"),
     }
     folder = store.folder_of(case, method)
+    digests = [texture.sha256 for texture in textures]
+    for item in planned:
+        item["texture_sha256"] = digests[item["texture"]]  # by which a panel sees that a texture has changed
     files.require_space(case.folder, len(planned) * size_px**2 * 2.5e-6 + 5)
     shards = make_shards(folder, planned, textures, settings)
     case.record("synthesize", method=method, styles=sorted({t.name for t in textures}), images=len(planned), done=False)
