@@ -17,11 +17,16 @@ import torch
 from .. import files
 from ..appearances.store import folder_of, read_appearances
 from ..case.case import Case
+from ..case.meshes import write_vtp
 from ..devices import fast_dtype
 from ..evaluation.metrics import add_mm
-from ..masks.stage import craniotomy_of, sampler_of
+from ..masks.exposed import exposed_vessels
+from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
+from ..registration.covariance import CovarianceModel, calibrate_covariance, correlated, pose_error
 from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
+from ..registration.predictor import EXPOSED_VESSELS_NAME
+from ..registration.refinement import VesselAligner
 from . import checkpoint
 from .encoding import PoseEncoding, fit_encoding, network_camera
 from .export import export_model
@@ -69,6 +74,7 @@ def train_case(
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
     folder = fold.folder if fold else case.model_folder
     trainer = _Trainer(case, preset, encoding, device, seed, views, folder)
+    made_from = files.sha256(folder_of(case, method) / "index.json")
     progress(0.0, "rendering validation views")
     workers = max(1, (os.cpu_count() or 2) - 1)
     validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
@@ -82,7 +88,14 @@ def train_case(
     figures = trainer.export(calibration, validation, on_record)
     if fold is None:
         model_sha256 = files.sha256(case.model_folder / "model.onnx")
-        case.record("train", done=True, validation=figures, method=method, model_sha256=model_sha256)
+        case.record(
+            "train",
+            done=True,
+            validation=figures,
+            method=method,
+            appearances_sha256=made_from,
+            model_sha256=model_sha256,
+        )
     return figures
 
 
@@ -117,6 +130,8 @@ class _Trainer:
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.best = self.average
         craniotomy = craniotomy_of(case)
+        self.exposed = exposed_vessels(case.vessels, parenchyma_of(case, craniotomy), craniotomy.outward_axis)
+        self.aligner = VesselAligner(self.exposed.vertices_mm, self.exposed.triangles, self.camera)
         ranges = sampler_of(case, 0).ranges
         distance = ranges.working_distance_mm
         self.plausible = PlausibleView(
@@ -196,6 +211,7 @@ class _Trainer:
         confidence = calibrate(evidence.reshape(usable.sum(), EVIDENCE[self.preset.estimator]), good[usable])
         probability = np.array([confidence.probability(r.evidence) for r in readings])
         accepted = probability >= confidence.threshold
+        covariance = self._covariance(readings, calibration, positive, probability, confidence.threshold)
         held_out_add = self._add(self._read(validation), validation)
         figures = {
             "add_mm_mean": round(float(held_out_add.mean()), 4),
@@ -218,10 +234,12 @@ class _Trainer:
             "encoding": self.encoding.to_dict(),
             "plausible_view": self.plausible.to_dict(),
             "confidence": confidence.to_dict(),
+            "covariance": covariance.to_dict(),
             "validation": figures,
             "vessels_sha256": self.case.manifest["inputs"]["vessels"]["sha256"],
         }
         files.write_json(self.folder / "training.json", {"curve": self.state["curve"], "validation": figures})
+        write_vtp(self.folder / EXPOSED_VESSELS_NAME, self.exposed)
         export_model(self.network.cpu(), self.preset, meta, self.folder)
         return figures
 
@@ -285,7 +303,7 @@ class _Trainer:
         outputs = np.concatenate([self.network(images[i : i + 32]).cpu().numpy() for i in range(0, len(images), 32)])
         if self.preset.estimator == "regression":
             return [read_regression(output, self.encoding) for output in outputs]
-        return [read_dense(output, self.camera, self.encoding) for output in outputs]
+        return [read_dense(output, self.camera, self.encoding, self.aligner) for output in outputs]
 
     def _add(self, readings: list[Reading], batch: Batch) -> np.ndarray:
         vertices = self.case.vessels.vertices_mm[::20]
@@ -296,6 +314,17 @@ class _Trainer:
             for r, true in zip(readings, batch.camera_from_world, strict=True)
         ]
         return np.array(errors)
+
+    def _covariance(self, readings, batch: Batch, positive, probability, threshold: float) -> CovarianceModel:
+        """From the accepted of the true views, at least the more trusted half: a refused pose is not used."""
+        found = np.array([r.camera_from_world is not None for r in readings]) & positive
+        least = min(threshold, np.median(probability[found])) if found.any() else threshold
+        chosen = np.flatnonzero(found & (probability >= least))
+        centre = self.encoding.centre_world_mm
+        errors = [pose_error(batch.camera_from_world[i], readings[i].camera_from_world, centre) for i in chosen]
+        none = np.zeros((6, 6))
+        fits = [none if readings[i].fit is None else correlated(readings[i].fit, centre) for i in chosen]
+        return calibrate_covariance(np.array(errors).reshape(-1, 6), np.array(fits).reshape(-1, 6, 6))
 
     def _save(self) -> None:
         checkpoint.save(self.folder, self.network, self.average, self.best, self.optimizer, self.state)
