@@ -336,5 +336,5 @@ def test_a_failing_job_of_a_cluster_stops_the_others(cluster, tmp_path):
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
     pytest.importorskip("dask.distributed", reason="dask.distributed is not installed")
     monkeypatch.setattr(executor, "CONNECT_S", 0.5)
-    with pytest.raises(InputError, match=r"no dask scheduler answers at dask://127\.0\.0\.1:9"):
-        executor.check_executor("dask://127.0.0.1:9")
+    with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        executor.connect("dask://127.0.0.1:9")
