@@ -13,12 +13,13 @@ from .. import files
 from ..case.case import Case
 from ..devices import choose_device
 from ..errors import InputError
+from ..executor import LOCAL, check_executor
 from ..geometry.camera import Camera
 from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, read_rendered
 from ..textures.library import Texture
 from . import store
-from .executors import LOCAL, check_executor, run_shards
+from .executors import run_shards
 from .overview import overview_view
 from .shards import Recipe, make_shards
 from .vgg import SHIPPED_WEIGHTS, load_vgg

@@ -65,7 +65,7 @@ def run(args, progress) -> None:
         if value is not None and value < least:
             problems.add(f"--{name}: {value}; give at least {least}.")
     if args.executor != "local":
-        from ..appearances.executors import check_executor
+        from ..executor import check_executor
 
         with problems.collect():
             check_executor(args.executor)
