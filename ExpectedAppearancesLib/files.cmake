@@ -47,6 +47,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/geometry/__init__.py
   ExpectedAppearancesLib/geometry/camera.py
   ExpectedAppearancesLib/geometry/pose.py
+  ExpectedAppearancesLib/geometry/se3.py
   ExpectedAppearancesLib/geometry/silhouette.py
   ExpectedAppearancesLib/masks/__init__.py
   ExpectedAppearancesLib/masks/labels.py
@@ -69,11 +70,14 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/poses/sampling.py
   ExpectedAppearancesLib/registration/__init__.py
   ExpectedAppearancesLib/registration/confidence.py
+  ExpectedAppearancesLib/registration/covariance.py
   ExpectedAppearancesLib/registration/decoding.py
+  ExpectedAppearancesLib/registration/footage.py
   ExpectedAppearancesLib/registration/pnp.py
   ExpectedAppearancesLib/registration/poses_file.py
   ExpectedAppearancesLib/registration/predictor.py
   ExpectedAppearancesLib/registration/record.py
+  ExpectedAppearancesLib/registration/tracking.py
   ExpectedAppearancesLib/textures/__init__.py
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py
