@@ -194,6 +194,48 @@ def test_view_through_the_camera_shows_the_vessels_where_the_frame_has_them(appl
     assert not (view.pixels().min(axis=2) > 128).any()
 
 
+def test_view_through_the_camera_has_the_frame_behind_the_vessels(application, case):
+    scene, logic = application
+    live = LiveScene(scene, case)
+    result = result_of(case)
+    result.image_rgb[:] = cv2.GaussianBlur(result.image_rgb, None, 3)
+    result.image_rgb[:40, :60] = (0, 0, 255)
+    live.show(result)
+    view = ThreeDView(scene, logic, "MicroscopeCamera", (640, 480))
+    other = ThreeDView(scene, logic, "MicroscopeOverview", (64, 48))
+    live.show_backdrop(view.node.GetID())
+    for node in (*live.models.values(), *live.lines.values(), live.frustum):
+        node.GetDisplayNode().SetVisibility(False)
+    for one in (view, other):
+        one.window.Render()
+        live_views.aim_camera(one.camera_node, one.window.GetSize(), CAMERA, live.camera_to_ras, live.plane_mm)
+        one.node.SetBackgroundColor(0, 1, 0)
+        one.node.SetBackgroundColor2(0, 1, 0)
+    pixels = view.pixels()
+    assert np.abs(pixels.astype(int) - result.image_rgb)[5:-5, 5:-5].mean() < 2
+    assert (other.pixels() == [0, 255, 0]).all()
+    live.show(result_of(case, accepted=False))
+    live.show_backdrop(view.node.GetID())
+    assert (view.pixels() == [0, 255, 0]).all()
+
+
+def test_banner_is_read_over_the_view_and_goes_without_a_trace(application, case):
+    from ExpectedAppearancesLib.mrml.live_banner import Banner
+
+    view, _live, _result = shown(application, case)
+    before = view.pixels()
+    banner = Banner(view.renderer)
+    assert banner.say("NO OVERLAY", (0.75, 0.08, 0.1))
+    assert not banner.say("NO OVERLAY", (0.75, 0.08, 0.1))
+    pixels = view.pixels()
+    red = is_colour(pixels, (0.75, 0.08, 0.1))
+    assert red[2].all() and red[-3].all() and red[:, 2].all() and red[:, -3].all()
+    assert (pixels[8:60] > 200).all(axis=2).any()  # white letters
+    np.testing.assert_array_equal(pixels[80:400, 20:620], before[80:400, 20:620])
+    banner.remove()
+    np.testing.assert_array_equal(view.pixels(), before)
+
+
 def test_a_frame_of_another_size_is_shown_whole_and_true(application, case):
     view, live, _result = shown(application, case)
     smaller = Camera(400, 480, 1350.0, 1350.0, 350.0 - 120, 215.0)

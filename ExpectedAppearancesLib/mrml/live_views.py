@@ -49,8 +49,8 @@ LAYOUT = f"""
 
 
 class LiveViews:
-    """The views of the live layout. through_view: gives camera node and size (px) of the view through the camera, or
-    None while there is none; depth_node: the MRI's slice, or None."""
+    """The views of the live layout. through_view: gives view node, camera node and size (px) of the view through the
+    camera, or None while there is none; depth_node: the MRI's slice, or None."""
 
     def __init__(self, slice_node, composite_node, through_view: Callable[[], tuple | None], depth_node=None):
         self._slice, self._composite = slice_node, composite_node
@@ -73,7 +73,8 @@ class LiveViews:
             align_depth_slice(self._depth, live.camera_to_ras, live.plane_mm)
         through = self._through_view()
         if through is not None:
-            camera_node, view_size_px = through
+            view_node, camera_node, view_size_px = through
+            live.show_backdrop(view_node.GetID())
             if visible:
                 aim_camera(camera_node, view_size_px, live.camera, live.camera_to_ras, live.plane_mm)
             else:
