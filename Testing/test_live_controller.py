@@ -105,7 +105,7 @@ def test_three_hundred_frames_each_with_its_own_pose_and_nothing_left_over(appli
     before = scene.GetNumberOfNodes()
     stream = node_with(scene, images[0])
     controller = LiveController(scene, views)
-    controller.start(choice_of(phantom), model=model)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
     counts, resident = [], []
     for number in range(300):
         if number % 25 == 24:
@@ -265,7 +265,7 @@ def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(app
     scene, _logic = application
     stream = node_with(scene, frames[1][0])
     controller = LiveController(scene)
-    controller.start(choice_of(phantom), model=model)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
     wait_for(controller, lambda s: s.new)
     controller.start_recording()
     send(stream, frames[1][1])
@@ -275,7 +275,7 @@ def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(app
     assert not [t for t in _threads() if "ExpectedAppearances" in t]
     after_close = scene.GetNumberOfNodes()
     node_with(scene, frames[1][2])
-    controller.start(choice_of(phantom), model=model)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     controller.close()
     scene.RemoveNode(scene.GetFirstNodeByName("Stream"))

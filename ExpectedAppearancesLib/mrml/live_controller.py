@@ -101,7 +101,8 @@ class LiveController:
         if self.case is None or self.case.folder != Path(folder).absolute() or self.live is None:
             case = Case.open(folder)
             case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now
-            self.close()
+            if self.live is not None:
+                self.close()
             self.case, self._overlays = case, OverlayMaker(case.vessels)
             self.live = LiveScene(self._scene, case)
             self.live.set_options(self.options)
