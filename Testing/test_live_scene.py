@@ -95,7 +95,7 @@ def shown(application, case, size=(640, 480), options=None):
 
 
 def draw(view, live, fit=True):
-    live_views.align_slice(view.node, live.camera, live.camera_to_ras, live.plane_mm)
+    live_views.align_slice(view.node, live.camera, live.camera_to_world, live.plane_mm)
     if fit:
         live_views.fit_slice(view.node, live.camera, live.plane_mm)
     live.set_view_pixel(live_views.view_pixel_mm(view.node))
@@ -114,6 +114,39 @@ def test_outline_lies_within_a_pixel_of_the_projected_silhouette(application, ca
     # The frame itself is shown pixel for pixel.
     same = np.abs(pixels.astype(int) - result.image_rgb).max(axis=2) <= 1
     assert same[~cv2.dilate(drawn.astype(np.uint8), np.ones((3, 3))).astype(bool)].mean() > 0.999
+
+
+def test_outline_and_view_hold_when_the_user_transforms_the_models(application, case):
+    import vtk
+
+    scene, logic = application
+    view, live, _result = shown(application, case)
+    moved = vtk.vtkTransform()
+    moved.Translate(40, -25, 60)
+    moved.RotateWXYZ(50, 1, 2, -0.5)
+    node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Patient moved")
+    node.SetMatrixTransformToParent(moved.GetMatrix())
+    for model in live.models.values():
+        model.SetAndObserveTransformNodeID(node.GetID())
+    live.show(result_of(case, OTHER_POSE, seed=1))
+    draw(view, live)
+    drawn = is_colour(view.pixels(), PREDICTED_RGB)
+    far_px, near_px = apart(case, OTHER_POSE, CAMERA, drawn)
+    assert drawn.sum() > 500 and far_px.max() <= 1.0 and near_px.max() < 1.5
+    # The vessels themselves, where they lie now, are seen there too.
+    through = ThreeDView(scene, logic, "MicroscopeCamera", (640, 480))
+    for each in (*live.lines.values(), live.frustum, live.models["Cortex"]):
+        each.GetDisplayNode().SetVisibility(False)
+    vessels = live.models["Vessels"].GetDisplayNode()
+    vessels.SetColor(1, 1, 1)
+    vessels.SetLighting(False)
+    through.node.SetBackgroundColor(0, 0, 0)
+    through.node.SetBackgroundColor2(0, 0, 0)
+    through.window.Render()
+    live_views.aim_camera(through.camera_node, (640, 480), CAMERA, live.camera_to_world, live.plane_mm)
+    seen = through.pixels().min(axis=2) > 128
+    expected = OverlayMaker(case.vessels).make(CAMERA, OTHER_POSE).fill.astype(bool)
+    assert (seen & expected).sum() / (seen | expected).sum() > 0.97
 
 
 def test_outline_stays_on_the_vessels_when_a_new_pose_comes(application, case):

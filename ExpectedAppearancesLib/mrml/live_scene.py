@@ -77,6 +77,7 @@ class LiveScene:
         if result.image_rgb is None:
             self.set_overlay_visible(False)
             return False
+        self.follow_models()
         changed = self._set_geometry(result.camera, result.overlay)
         self._set_pixels(result.image_rgb, changed)
         if result.overlay is not None:
@@ -86,6 +87,19 @@ class LiveScene:
         self.show_truth(None, None)
         self._stamp = self._newest_change()
         return changed
+
+    @property
+    def camera_to_world(self) -> np.ndarray:
+        """Camera mm to what the views show: RAS, moved as the case's models are where they hang under a transform."""
+        return matrix_of(self.transform, to_world=True)
+
+    def follow_models(self) -> None:
+        """Hang camera and frame under the transform that the user put the vessels under, if any."""
+        parent = self.models[scenes.VESSELS].GetParentTransformNode()
+        if parent is not None and parent.GetAttribute(ROLE_ATTRIBUTE):
+            return  # the handles of the alignment: then the vessels move and the camera does not
+        if self.transform.GetParentTransformNode() is not parent:
+            self.transform.SetAndObserveTransformNodeID(parent.GetID() if parent is not None else None)
 
     @property
     def intact(self) -> bool:
@@ -297,12 +311,15 @@ def _nodes(scene) -> list:
     return [collection.GetItemAsObject(i) for i in range(collection.GetNumberOfItems())]
 
 
-def matrix_of(transform_node) -> np.ndarray:
-    """4x4 of a linear transform node, to its parent."""
+def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
+    """4x4 of a linear transform node, to its parent or to the world."""
     from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
     matrix = vtkMatrix4x4()
-    transform_node.GetMatrixTransformToParent(matrix)
+    if to_world:
+        transform_node.GetMatrixTransformToWorld(matrix)
+    else:
+        transform_node.GetMatrixTransformToParent(matrix)
     return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
 
 

@@ -140,14 +140,14 @@ class LivePanel:
     def start(self, single: bool = False) -> bool:
         """Start what is chosen. False, and the reason in the panel, when it cannot be started."""
         self.say("")
-        slicer.app.setOverrideCursor(qt.Qt.WaitCursor)
+        qt.QApplication.setOverrideCursor(qt.Qt.WaitCursor)
         try:
             self.controller.start(self.source.choice(), single)
         except ExpectedAppearancesError as error:
             self.say(str(error))
             return False
         finally:
-            slicer.app.restoreOverrideCursor()
+            qt.QApplication.restoreOverrideCursor()
         self._parameter_node.browser = None
         self.refresh()
         self.tick()
