@@ -26,8 +26,9 @@ from .evaluate import Evaluation, check_out, compare, known_frames, overlay_imag
 from .metrics import add_auc, add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, FoldJob, is_trained, train_fold
+from .verdict import STUDY_FORMAT
 
-FORMAT, FORMAT_VERSION = "ExpectedAppearances study", 1
+FORMAT_VERSION = 1
 LEFT_OUT = 3  # textures of the number-of-textures study that no model is trained on
 TEXTURE_COUNTS = range(3, 13)
 CURVE_STEP = 0.25  # mm and degrees between the points of the curves
@@ -112,7 +113,11 @@ def read_study(case_folder: Path) -> dict | None:
     if not path.is_file():
         return None
     values = files.read_json(path, "study")
-    if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("presets"), dict):
+    if (
+        not isinstance(values, dict)
+        or values.get("format") != STUDY_FORMAT
+        or not isinstance(values.get("presets"), dict)
+    ):
         raise InputError(f"{path}: not the result of a study; run `study` again.")
     if not isinstance(values.get("format_version"), int) or values["format_version"] > FORMAT_VERSION:
         raise InputError(f"{path}: made by a newer version; update ExpectedAppearances, or run `study` again.")
@@ -256,7 +261,12 @@ def _begin(one: StudyCase, settings: StudySettings) -> dict:
         before = None
     if before and before.get("inputs") == one.inputs:
         return before
-    study = {"format": FORMAT, "format_version": FORMAT_VERSION, "case": one.case.folder.name, "inputs": one.inputs}
+    study = {
+        "format": STUDY_FORMAT,
+        "format_version": FORMAT_VERSION,
+        "case": one.case.folder.name,
+        "inputs": one.inputs,
+    }
     distances = nearest_other_pose_add_mm(one.case.vessels.vertices_mm, [f.camera_from_world for f in one.frames])
     study["nearest_other_pose_add_mm"] = float(np.mean(distances)) if len(distances) else None
     return study | {"presets": {}, "preset": settings.presets[0], "protocols": {}, "thresholds": {}}
