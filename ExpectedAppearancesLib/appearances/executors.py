@@ -13,7 +13,7 @@ from .shards import Recipe, Shard, work_on
 
 POLL_S = 1.0
 
-OnProgress = Callable[[float, str], None]  # images done (with fractions), name of the shard
+OnProgress = Callable[[float, str], None]  # images done (with fractions), what is made
 
 
 def run_shards(shards: list[Shard], recipe: Recipe, executor: str, on_progress: OnProgress) -> None:
@@ -32,9 +32,10 @@ def _run_here(shards: list[Shard], recipe: Recipe, on_progress: OnProgress) -> N
         for shard in waiting:
             missing = len(shard.items) - len(shard.finished())
             before = done + len(shard.items) - missing
-            on_progress(before, shard.name)
+            name = f"texture {shard.texture.name}"
+            on_progress(before, name)
             try:
-                made = work_on(shard, recipe, lambda n, shard=shard, before=before: on_progress(before + n, shard.name))
+                made = work_on(shard, recipe, lambda n, name=name, before=before: on_progress(before + n, name))
             except ClaimLost:
                 made = None
             if made is None:
@@ -42,7 +43,7 @@ def _run_here(shards: list[Shard], recipe: Recipe, on_progress: OnProgress) -> N
             else:
                 done += len(shard.items)
         if held:
-            on_progress(done, held[0].name)
+            on_progress(done, f"texture {held[0].texture.name}")
             time.sleep(POLL_S)
         waiting = held
 

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from ExpectedAppearancesLib.geometry.camera import Camera
+from ExpectedAppearancesLib.geometry.pose import pose_from_rotation, transform
+from ExpectedAppearancesLib.registration.covariance import (
+    UNCALIBRATED,
+    CovarianceModel,
+    calibrate_covariance,
+    correlated,
+    pose_error,
+)
+from ExpectedAppearancesLib.registration.pnp import PoseFit, fit_pose
+
+CAMERA = Camera(128, 128, 240.0, 236.0, 66.0, 61.0)
+CENTRE = np.array([30.0, -60.0, 45.0])
+
+
+def view(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    turned = Rotation.from_rotvec(np.radians(30) * rng.uniform(-1, 1, 3)) * Rotation.from_euler("x", 180, degrees=True)
+    rotation = turned.as_matrix()
+    return pose_from_rotation(rotation, rng.uniform([-5, -5, 85], [5, 5, 130]) - rotation @ CENTRE)
+
+
+def fit_of(true: np.ndarray, rng, sigma_mm: float, count: int = 400) -> PoseFit:
+    """A fit whose points err in patches: what a network gets wrong it gets wrong for all its neighbours."""
+    across = rng.uniform([-12, -19], [20, 13], (count, 2))
+    points = CENTRE + np.column_stack([across, -0.01 * (across**2).sum(axis=1)])
+    seen = transform(true, points)
+    pixels = seen[:, :2] / seen[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+    patches = rng.normal(size=(3, 3, 3))[tuple(((across + 16) // 12).astype(int).clip(0, 2).T)]
+    return fit_pose(points + sigma_mm * patches, pixels, np.full(count, sigma_mm), CAMERA)
+
+
+def simulated(count: int, seed: int):
+    """Errors and `correlated` covariances of fits that are three times as good in some views as in others."""
+    rng = np.random.default_rng(seed)
+    errors, fits, independent = [], [], []
+    for i in range(count):
+        true = view(1000 * seed + i)
+        fit = fit_of(true, rng, rng.uniform(0.2, 0.6))
+        errors.append(pose_error(true, fit.camera_from_world, CENTRE))
+        fits.append(correlated(fit, CENTRE))
+        independent.append(fits[-1] / fit.residuals)
+    return np.array(errors), np.array(fits), np.array(independent)
+
+
+def normalised(errors, covariances) -> np.ndarray:
+    return np.array([e @ np.linalg.solve(c, e) for e, c in zip(errors, covariances, strict=True)])
+
+
+def test_calibrated_covariance_is_consistent_where_residuals_are_correlated():
+    model = calibrate_covariance(*simulated(120, 1)[:2])
+    errors, fits, independent = simulated(120, 2)
+    # As if independent, a pose seems ten times better than it is.
+    assert normalised(errors, independent).mean() > 60
+    distances = normalised(errors, model.scale * fits)
+    assert distances.mean() == pytest.approx(6, rel=0.2)
+    assert (distances > chi2.ppf(0.95, 6)).mean() < 0.11 and (distances < chi2.ppf(0.5, 6)).mean() < 0.62
+    # One common error for all residuals is the worst case, and what a model without calibration gets.
+    assert model.scale < UNCALIBRATED.scale and CovarianceModel.from_dict(None) == UNCALIBRATED
+
+
+def test_covariance_is_about_the_cases_centre_in_camera_axes():
+    """Against poses drawn from the fit's own covariance, about its points' centre, far from the case's centre."""
+    rng = np.random.default_rng(3)
+    spread = np.diag([0.01, 0.02, 0.03, 0.2, 0.3, 1.0])
+    fit = PoseFit(view(4), spread @ spread, 1.0, 1.0, CENTRE + np.array([25.0, -10.0, 3.0]), 50)
+    errors = []
+    for _ in range(4000):
+        drawn = spread @ rng.normal(size=6)
+        rotation = Rotation.from_rotvec(drawn[:3]).as_matrix() @ fit.camera_from_world[:3, :3]
+        middle = transform(fit.camera_from_world, fit.centre_world_mm[None])[0] + drawn[3:]
+        true = pose_from_rotation(rotation, middle - rotation @ fit.centre_world_mm)
+        errors.append(pose_error(true, fit.camera_from_world, CENTRE))
+    sampled = np.cov(np.array(errors).T, bias=True)
+    expected = correlated(fit, CENTRE) / 50
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(sampled / np.outer(size, size), expected / np.outer(size, size), atol=0.08)
+
+
+def test_lost_views_do_not_blow_the_covariance_up():
+    errors, fits, _ = simulated(150, 5)
+    clean = calibrate_covariance(errors, fits).scale
+    errors[:2] = [0.5, 0.5, 0.5, 20, 20, 60]
+    assert calibrate_covariance(errors, fits).scale < 1.5 * clean
+
+
+def test_poses_without_fits_have_the_spread_of_their_errors():
+    rng = np.random.default_rng(6)
+    spread = np.diag([0.02, 0.03, 0.01, 0.5, 0.4, 2.0])
+    spread[3, 1] = 0.4
+    errors = rng.normal(size=(600, 6)) @ spread.T
+    errors[:4] *= 15
+    model = calibrate_covariance(errors, None)
+    size = np.sqrt(np.diag(spread @ spread.T))
+    np.testing.assert_allclose(model.fixed / np.outer(size, size), spread @ spread.T / np.outer(size, size), atol=0.15)
+    again = CovarianceModel.from_dict(json.loads(json.dumps(model.to_dict())))
+    np.testing.assert_array_equal(again.covariance(None, CENTRE), model.fixed)
+    assert UNCALIBRATED.covariance(None, CENTRE) is None
+
+
+def test_few_views_calibrate_nothing():
+    errors, fits, _ = simulated(8, 7)
+    assert calibrate_covariance(errors, fits) == UNCALIBRATED
+    assert calibrate_covariance(np.zeros((0,)), np.zeros((0,))) == UNCALIBRATED
