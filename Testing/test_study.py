@@ -51,6 +51,7 @@ if (here / "fail").exists():
 folder.mkdir(parents=True, exist_ok=True)
 (folder / "model.onnx").write_text("model of " + folder.name)
 figures = {"steps": 5, "seconds": 1.0, "add_mm_mean": 2.0}
+(folder / "checkpoint.safetensors").write_text("")
 (folder / "training.json").write_text(json.dumps({"validation": figures}))
 """
 
@@ -140,6 +141,7 @@ def test_figures_of_both_protocols_are_those_computed_by_hand(studied):
     made = {(words[words.index("--exclude") + 1], "--poses" in words) for words in calls(studied)}
     assert made == {(style, repeats) for style in "abc" for repeats in (False, True)}
     assert all(words[0] == "train" and words[words.index("--steps") + 1] == "5" for words in calls(studied))
+    assert not list(studied.case.rglob("checkpoint.safetensors"))
     assert (studied.case / "case.json").read_bytes() == before and not (studied.case / "model").exists()
 
 
@@ -242,9 +244,9 @@ def test_a_stopped_fold_leaves_no_process_and_says_what_it_did(studied):
     job, heard = some_job(studied), []
     with pytest.raises(CancelledError):
         study_folds.train_fold(
-            job, lambda fraction, text: heard.append((fraction, text)), lambda: (0.6, "step 2") in heard
+            job, lambda fraction, text: heard.append((fraction, text)), lambda: (0.6, "quick-strict-a: step 2") in heard
         )
-    assert (0.5, "step 1, loss 0.5 (3 s left)") in heard
+    assert (0.5, "quick-strict-a: step 1, loss 0.5") in heard
     assert not alive(int((studied.trainer / "pid").read_text())) and not study_folds.is_trained(job)
 
 

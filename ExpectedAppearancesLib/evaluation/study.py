@@ -25,7 +25,7 @@ from .curves import curve_points
 from .evaluate import Evaluation, check_out, compare, known_frames, overlay_images, register_frames
 from .metrics import add_auc, add_mm
 from .overlays import choose_frames, sheet
-from .study_folds import PROTOCOLS, FoldJob, is_trained, train_fold
+from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
 from .verdict import STUDY_FORMAT
 
 FORMAT_VERSION = 1
@@ -91,6 +91,9 @@ def run_study(
     studied = _check(pairs, out_folder, settings)
     jobs = [job for one in studied for job in _jobs(one, settings)]
     waiting = [job for job in jobs if not is_trained(job)]
+    for one in studied:
+        count = sum(job.case_folder == str(one.case.folder) for job in waiting)
+        files.require_space(one.folder, count * SPACE_MB["fold"] + SPACE_MB["under way"])
     progress(0.0, f"{len(waiting)} of {len(jobs)} models are to be trained")
     run_jobs(waiting, train_fold, settings.executor, lambda f, text: progress(TRAINING_SHARE * f, text))
 
