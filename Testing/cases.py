@@ -8,6 +8,7 @@ import numpy as np
 
 from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
 from ExpectedAppearancesLib.geometry.camera import Camera, write_camera
+from ExpectedAppearancesLib.textures.library import Texture
 
 
 def dome(side_mm: float = 40.0, cells: int = 24, bulge_mm: float = 4.0) -> Mesh:
@@ -60,3 +61,20 @@ def write_inputs(folder) -> dict:
     write_vtp(paths["cortex.vtp"], dome())
     write_camera(paths["camera.json"], camera())
     return paths
+
+
+def label_map(size: int = 48) -> np.ndarray:
+    """Background, parenchyma and vessels, without symmetry."""
+    labels = np.zeros((size, size), np.uint8)
+    labels[4:-4, 2:-6] = 1
+    labels[size // 3 : size // 2, : size // 2] = 2
+    return labels
+
+
+def texture(name: str = "a", vessel_colour=(40, 30, 160), size: int = 48) -> Texture:
+    """Two colours with noise, one for each class."""
+    rng = np.random.default_rng(5)
+    labels = np.ones((size, size), np.uint8)
+    labels[size // 2 :, size // 3 : size // 2] = 2
+    image = np.where((labels == 2)[..., None], vessel_colour, (210, 130, 110)) + rng.normal(0, 15, (size, size, 3))
+    return Texture(name, np.clip(image, 0, 255).astype(np.uint8), labels)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 
 from .vgg import VggFeatures
+
+# A Gram matrix is summed over so many pixels in the compute type, and over these sums in fp32: bf16 loses nothing
+# that matters, and the order of the additions depends neither on the batch nor on the number of threads.
+PIXELS_PER_SUM = 512
 
 
 def class_masks(labels: torch.Tensor, classes: tuple[int, ...]) -> torch.Tensor:
@@ -14,75 +20,152 @@ def class_masks(labels: torch.Tensor, classes: tuple[int, ...]) -> torch.Tensor:
 
 def class_gram(features: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Gram matrices (B, K, K) of features (B, K, H, W) times mask (B, H, W), over elements x mean of the mask."""
-    batch, channels, height, width = features.shape
-    masked = (features.float() * mask[:, None]).reshape(batch, channels, height * width)
-    elements = channels * height * width * mask.mean(dim=(1, 2)).clamp_min(1e-8)
-    return torch.bmm(masked, masked.transpose(1, 2)) / elements[:, None, None]
+    masked = (features.float() * mask[:, None]).flatten(2)
+    masked = torch.nn.functional.pad(masked, (0, -masked.shape[2] % PIXELS_PER_SUM)).transpose(1, 2)
+    elements = features.shape[1] * mask.sum(dim=(1, 2)).clamp_min(1e-8)
+    return _gram(masked) / elements[:, None, None]
 
 
-class _GramDistance(torch.autograd.Function):
-    """Squared distance of one image's class-wise Grams to their targets at one layer, with its gradient by hand.
+def _gram(rows: torch.Tensor) -> torch.Tensor:
+    """(B, P, K) -> (B, K, K) float32; P is less than PIXELS_PER_SUM or a multiple of it."""
+    batch, pixels, channels = rows.shape
+    sums = rows.reshape(-1, min(PIXELS_PER_SUM, pixels), channels)
+    return torch.bmm(sums.transpose(1, 2), sums).view(batch, -1, channels, channels).float().sum(dim=1)
 
-    Works on each class's pixels only and keeps nothing for the backward pass but the features' gradient, which is
-    2 m^2 F (G - T) * 2 / elements: zero wherever the class's mask is zero, so nothing leaks between classes.
+
+@dataclass(frozen=True)
+class ClassTerm:
+    """What one class asks of one feature layer, for B images: their pixels, softened masks there and target Grams.
+
+    pixels (B * P,) rows of the features laid out (B * H * W, K), those of full mask first, filled up to P with rows
+    of mask 0; soft (B, P - full, 1): the masks after the first `full` rows; target (B, K, K); elements (B, 1, 1):
+    number of elements x mean mask; weight (B, 1, 1): 1 over the target's squared norm, 0 where there is none.
     """
 
-    @staticmethod
-    def forward(ctx, features, pixels, squared_masks, targets, elements):
-        """features (1, K, H, W); per class: pixel indices (P,), mask^2 (P, 1), target (K, K), elements x mean mask.
+    pixels: torch.Tensor
+    full: int
+    soft: torch.Tensor
+    target: torch.Tensor
+    elements: torch.Tensor
+    weight: torch.Tensor
 
-        Each class's distance is relative to its target's squared norm.
+    @staticmethod
+    def of(masks: torch.Tensor, target: torch.Tensor, dtype: torch.dtype) -> ClassTerm | None:
+        """masks (B, H, W), target (B, K, K) with NaN where the texture lacks the class; None where nothing is asked."""
+        usable = ~torch.isnan(target).flatten(1).any(dim=1)
+        flat = masks.flatten(1) * usable[:, None]
+        counts = (flat > 0).sum(dim=1)
+        if not int(counts.max()):
+            return None
+        length = -(-int(counts.max()) // min(PIXELS_PER_SUM, flat.shape[1])) * min(PIXELS_PER_SUM, flat.shape[1])
+        order = torch.argsort(flat, dim=1, descending=True, stable=True)
+        order = torch.nn.functional.pad(order, (0, max(0, length - flat.shape[1])))[:, :length]
+        weights = torch.gather(flat, 1, order)
+        weights[:, flat.shape[1] :] = 0
+        full = int((weights >= 1 - 1e-6).sum(dim=1).min())
+        offsets = torch.arange(len(masks), device=masks.device)[:, None] * flat.shape[1]
+        target = torch.where(usable[:, None, None], target, torch.zeros_like(target))
+        norms = target.square().sum(dim=(1, 2))
+        asked = usable & (counts > 0) & (norms > 0)
+        return ClassTerm(
+            (order + offsets).flatten(),
+            full,
+            weights[:, full:, None].to(dtype),
+            target,
+            (flat.sum(dim=1).clamp_min(1e-8) * target.shape[-1])[:, None, None],
+            torch.where(asked, 1 / norms.clamp_min(1e-30), torch.zeros_like(norms))[:, None, None],
+        )
+
+    def add(self, rows: torch.Tensor, gradient_rows: torch.Tensor | None) -> torch.Tensor:
+        """Squared relative distance (B,) for features laid out (B * H * W, K); its gradient is added in place.
+
+        The gradient, 4 m^2 F (G - T) / elements, is zero wherever the class's mask is zero: nothing leaks.
         """
-        flat = features[0].permute(1, 2, 0).reshape(-1, features.shape[1])
-        gradient = torch.zeros_like(flat)
-        total = torch.zeros((), device=features.device)
-        for index, squared_mask, target, count in zip(pixels, squared_masks, targets, elements, strict=True):
-            own = flat[index]
-            difference = (own * squared_mask.to(own.dtype)).T.float() @ own.float() / count - target
-            norm = target.square().sum()
-            total += difference.square().sum() / norm
-            gradient.index_add_(
-                0, index, (own @ (difference * (4 / (count * norm))).to(own.dtype)) * squared_mask.to(own.dtype)
-            )
-        ctx.save_for_backward(gradient)
-        ctx.shape = features.shape
-        return total
-
-    @staticmethod
-    def backward(ctx, upstream):
-        (gradient,) = ctx.saved_tensors
-        _, channels, height, width = ctx.shape
-        gradient = (gradient * upstream.to(gradient.dtype)).reshape(1, height, width, channels).permute(0, 3, 1, 2)
-        return gradient, None, None, None, None
+        batch, channels = len(self.target), rows.shape[1]
+        own = rows.index_select(0, self.pixels).view(batch, -1, channels)
+        own[:, self.full :] *= self.soft
+        difference = _gram(own) / self.elements - self.target
+        distance = (difference.square().sum(dim=2) * self.weight[:, 0]).sum(dim=1)
+        if gradient_rows is not None:
+            difference *= 4 * self.weight / self.elements
+            change = torch.bmm(own, difference.to(own.dtype))
+            change[:, self.full :] *= self.soft
+            gradient_rows.index_add_(0, self.pixels, change.view(-1, channels))
+        return distance
 
 
 class ClassGramLoss:
     """Loss per image (B,) between the Grams of images and their targets, layer by layer and class by class.
 
-    A class that a mask does not show, or that its target lacks, adds nothing.
+    Each class's distance is relative to its target's squared norm. A class that a mask does not show, or that its
+    target lacks, adds nothing.
     """
 
-    def __init__(self, vgg: VggFeatures, labels: torch.Tensor, targets: list[torch.Tensor], classes: tuple[int, ...]):
-        """labels (B, H, W); targets: per layer (B, C, K, K), NaN for a class the texture lacks."""
+    def __init__(
+        self,
+        vgg: VggFeatures,
+        labels: torch.Tensor,
+        targets: list[torch.Tensor],
+        classes: tuple[int, ...],
+        pixels_at_once: int | None = None,
+    ):
+        """labels (B, H, W); targets: per layer (B, C, K, K), NaN for a class the texture lacks.
+
+        pixels_at_once: bound of the images taken through the network together (at least one); None: all.
+        """
         self.vgg = vgg
+        together = max(1, (pixels_at_once or labels.numel()) // labels[0].numel())
+        self._parts = [slice(b, b + together) for b in range(0, len(labels), together)]
+        # On a processor each image has its own lists of pixels; on a GPU one list, filled up, saves launches.
+        self._per_image = labels.device.type == "cpu"
         self._terms = []
         for masks, target in zip(vgg.carry_masks(class_masks(labels, classes)), targets, strict=True):
-            layer = []
-            for b in range(len(labels)):
-                used = [c for c in range(len(classes)) if masks[b, c].any() and not torch.isnan(target[b, c]).any()]
-                flat = [masks[b, c].flatten() for c in used]
-                pixels = [m.nonzero().squeeze(1) for m in flat]
-                squared = [m[p, None].square() for m, p in zip(flat, pixels, strict=True)]
-                elements = [float(m.sum()) * target.shape[-1] for m in flat]
-                layer.append((pixels, squared, [target[b, c] for c in used], elements))
-            self._terms.append(layer)
+            groups = [slice(b, b + 1) for b in range(len(labels))] if self._per_image else self._parts
+            self._terms.append(
+                [
+                    [ClassTerm.of(masks[g, c], target[g, c], vgg.compute_dtype) for c in range(len(classes))]
+                    for g in groups
+                ]
+            )
 
     def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        """Loss (B,) of images (B, 3, H, W), without gradient."""
         total = torch.zeros(len(images), device=images.device)
-        for features, layer in zip(self.vgg(images), self._terms, strict=True):
-            distances = [_GramDistance.apply(features[b : b + 1], *term) for b, term in enumerate(layer)]
-            total = total + torch.stack(distances)
+        for p, part in enumerate(self._parts):
+            for layer, features in enumerate(self.vgg(images[part])):
+                self._add_layer(total, p, layer, features, None)
         return total
+
+    def value_and_gradient(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Loss (B,) and its gradient (B, 3, H, W), float32."""
+        total = torch.zeros(len(images), device=images.device)
+        gradient = torch.empty(images.shape, device=images.device)
+        for p, part in enumerate(self._parts):
+            gradient[part] = self.vgg.input_gradient(
+                self.vgg.activations(images[part]), lambda layer, x, g, p=p: self._add_layer(total, p, layer, x, g)
+            )
+        return total, gradient
+
+    def _add_layer(
+        self, total: torch.Tensor, part_index: int, layer: int, features: torch.Tensor, gradient: torch.Tensor | None
+    ) -> None:
+        part = self._parts[part_index]
+        flat = rows_of(features)
+        flat_gradient = None if gradient is None else rows_of(gradient)
+        if not self._per_image:
+            for term in filter(None, self._terms[layer][part_index]):
+                total[part] += term.add(flat, flat_gradient)
+            return
+        size = len(flat) // len(features)
+        for b in range(len(features)):
+            own = slice(b * size, (b + 1) * size)
+            for term in filter(None, self._terms[layer][part.start + b]):
+                total[part.start + b] += term.add(flat[own], None if gradient is None else flat_gradient[own])[0]
+
+
+def rows_of(features: torch.Tensor) -> torch.Tensor:
+    """Channels-last (B, K, H, W) seen as (B * H * W, K), the same memory."""
+    return features.permute(0, 2, 3, 1).view(-1, features.shape[1])
 
 
 @torch.no_grad()

@@ -1,8 +1,7 @@
-"""The `synthesize` stage: expected appearances of a case, resumable image by image."""
+"""The `synthesize` stage: expected appearances of a case, resumable image by image, by one process or many."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,16 +10,18 @@ import torch
 
 from .. import files
 from ..case.case import Case
-from ..devices import choose_device, fast_dtype
+from ..devices import choose_device
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, read_rendered
 from ..textures.library import Texture
 from . import store
+from .executors import LOCAL, check_executor, run_shards
 from .overview import overview_view
-from .synthesis import Job, Synthesizer
+from .shards import Recipe, make_shards
 from .vgg import SHIPPED_WEIGHTS, load_vgg
+from .workload import DEFAULT_ITERATIONS
 
 
 def synthesize_case(
@@ -31,19 +32,22 @@ def synthesize_case(
     size_px: int = 384,
     seeds: int = 1,
     every_texture: bool = False,
-    iterations: int = 50,
+    iterations: int = DEFAULT_ITERATIONS,
     weights_path: Path | None = None,
-    batch: int = 1,
+    batch: int | None = None,
     device: torch.device | None = None,
-) -> None:
-    """Make the appearances that are not there yet.
+    executor: str = LOCAL,
+) -> dict[str, float]:
+    """Make the appearances that are not there yet; returns the mean Gram distance by class (GramMeasure).
 
     method `surface`: one overview per texture and seed. `image`: one image per rendered pose, textures taken in turn,
     or with `every_texture` each pose with each texture (the paper's 100 x 15).
+    batch: images optimised together, None as memory allows. executor: `local` or `dask://HOST:PORT`.
     """
+    check_executor(executor)
     device = device or choose_device("auto")
-    vgg = load_vgg(weights_path, fast_dtype(device))
-    weights_file = Path(weights_path) if weights_path else SHIPPED_WEIGHTS
+    backbone = load_vgg(weights_path).backbone
+    weights_file = Path(weights_path or SHIPPED_WEIGHTS).absolute()
     if method == "surface":
         camera, planned = _plan_surface(case, textures, size_px, seeds)
     else:
@@ -51,7 +55,7 @@ def synthesize_case(
     settings = {
         "size_px": size_px,
         "iterations": iterations,
-        "backbone": vgg.backbone,
+        "backbone": backbone,
         "weights_sha256": files.sha256(weights_file),
         # What the label maps depend on: an appearance on an older one is made again.
         "overview": planned[0]["camera_from_world"] if method == "surface" else None,
@@ -60,50 +64,44 @@ def synthesize_case(
     }
     folder = store.folder_of(case, method)
     files.require_space(case.folder, len(planned) * size_px**2 * 2.5e-6 + 5)
-    done = _finished_items(case, method, settings)
-    synthesizer = Synthesizer(vgg, device, iterations)
-    digests = [_digest(texture) for texture in textures]
-    for item in planned:
-        item["texture_sha256"] = digests[item["texture"]]
-        if done.get(item["image"], item)["texture_sha256"] != item["texture_sha256"]:
-            del done[item["image"]]
-    waiting = [item for item in planned if item["image"] not in done]
+    shards = make_shards(folder, planned, textures, settings)
     case.record("synthesize", method=method, styles=sorted({t.name for t in textures}), images=len(planned), done=False)
-    store.write_index(case, method, camera, settings, list(done.values()), done=False)
-    finished = len(planned) - len(waiting)
-    for begin in range(0, len(waiting), batch):
-        part = waiting[begin : begin + batch]
-        jobs = [
-            Job(files.read_label_map(folder / item["labels"]), textures[item.pop("texture")], item["seed"])
-            for item in part
-        ]
-
-        def report(iteration: int, at=finished, part=part) -> None:
-            fraction = (at + len(part) * iteration / max(1, iterations)) / len(planned)
-            progress(fraction, f"appearance {at + 1} of {len(planned)}, texture {part[0]['style']}")
-
-        for item, (image, distance) in zip(part, synthesizer.run(jobs, report), strict=True):
-            files.write_png(folder / item["image"], image)
-            done[item["image"]] = item | {"gram_distance": round(distance, 5)}
-        finished += len(part)
-        store.write_index(case, method, camera, settings, list(done.values()), done=False)
-    items = [done[item["image"]] for item in planned]
+    store.write_index(case, method, camera, settings, [], done=False)
+    recipe = Recipe(
+        iterations, str(weights_file) if weights_path else None, settings["weights_sha256"], device.type, batch
+    )
+    run_shards(
+        shards,
+        recipe,
+        executor,
+        lambda images, name: progress(
+            min(1.0, images / len(planned)),
+            f"appearance {min(int(images) + 1, len(planned))} of {len(planned)}, {name}",
+        ),
+    )
+    made = {}
+    for shard in shards:
+        made.update(shard.finished())
+    figures = ("gram_distance", "gram_distance_by_class")
+    items = [
+        {name: value for name, value in item.items() if name != "texture"}
+        | {name: made[item["image"]][name] for name in figures}
+        for item in planned
+    ]
     store.write_index(case, method, camera, settings, items, done=True)
-    mean_distance = float(np.mean([item["gram_distance"] for item in items]))
-    case.record("synthesize", done=True, **settings, gram_distance_mean=mean_distance)
+    by_class = mean_distances(items)
+    total = round(sum(by_class.values()), 4)
+    case.record("synthesize", done=True, **settings, gram_distance_mean=total, gram_distance_by_class=by_class)
+    return by_class
 
 
-def _digest(texture: Texture) -> str:
-    return hashlib.sha256(texture.image.tobytes() + texture.labels.tobytes()).hexdigest()
-
-
-def _finished_items(case: Case, method: str, settings: dict) -> dict[str, dict]:
-    """What an interrupted run of the same settings has finished."""
-    index = store.read_index(case, method)
-    if not index or index["settings"] != settings:
-        return {}
-    folder = store.folder_of(case, method)
-    return {item["image"]: item for item in index["items"] if (folder / item["image"]).is_file()}
+def mean_distances(items: list[dict]) -> dict[str, float]:
+    """Mean of `gram_distance_by_class` over the items that show the class."""
+    found: dict[str, list[float]] = {}
+    for item in items:
+        for name, distance in item["gram_distance_by_class"].items():
+            found.setdefault(name, []).append(distance)
+    return {name: round(float(np.mean(values)), 4) for name, values in found.items()}
 
 
 def _plan_surface(case: Case, textures: list[Texture], size_px: int, seeds: int) -> tuple[Camera, list[dict]]:

@@ -25,7 +25,7 @@ class Appearance:
     seed: int
     camera: Camera
     camera_from_world: np.ndarray
-    gram_distance: float
+    gram_distance: float  # to the texture, both classes together (measure.GramMeasure)
 
 
 def folder_of(case: Case, method: str) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -13,13 +15,14 @@ SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "vgg16_imagenet_to_conv5_1
 VGG19_OFFICIAL = ("https://download.pytorch.org/models/vgg19-dcbb9e9d.pth", "dcbb9e9d")
 BGR_MEAN = (103.939, 116.779, 123.68)  # of ImageNet, 0..255
 CONVOLUTIONS = {"vgg16": (2, 2, 3, 3, 1), "vgg19": (2, 2, 4, 4, 1)}  # per block, up to conv5_1
-_WIDTHS = (64, 128, 256, 512, 512)
+WIDTHS = (64, 128, 256, 512, 512)
 
 
 class VggFeatures(torch.nn.Module):
     """(B, 3, H, W) BGR 0..255 minus the mean -> features after relu of the first convolution of each block.
 
-    compute_dtype: bfloat16 where the processor multiplies it fast, else float32. Weights are frozen.
+    compute_dtype: bfloat16 where the processor multiplies it fast, else float32. Weights are frozen. Everything is
+    channels-last, and an image's features are the same bits whatever the batch it is in.
     """
 
     def __init__(self, weights: dict[str, torch.Tensor], backbone: str, compute_dtype: torch.dtype = torch.float32):
@@ -30,32 +33,107 @@ class VggFeatures(torch.nn.Module):
             f"conv{block + 1}_{k + 1}" for block, count in enumerate(CONVOLUTIONS[backbone]) for k in range(count)
         ]
         for name in self.names:
-            weight = weights[f"{name}.weight"].to(compute_dtype).contiguous(memory_format=torch.channels_last)
-            self.register_buffer(f"{name}_weight", weight, persistent=False)
+            weight = weights[f"{name}.weight"].to(compute_dtype)
+            # The gradient of a 3x3 convolution with respect to its input is one with the weights turned round. After
+            # a pool it also takes the pool's 1/4, which is exact.
+            turned = weight.transpose(0, 1).flip(2, 3) * (0.25 if self._follows_pool(name) else 1.0)
+            for key, value in (("weight", weight), ("turned", turned)):
+                self.register_buffer(
+                    f"{name}_{key}", value.contiguous(memory_format=torch.channels_last), persistent=False
+                )
             self.register_buffer(f"{name}_bias", weights[f"{name}.bias"].to(compute_dtype), persistent=False)
+        self._packed: dict[tuple, torch.Tensor] = {}
 
     def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
+        return [x for name, x in zip(self.names, self.activations(image)) if name.endswith("_1")]
+
+    @torch.no_grad()
+    def activations(self, image: torch.Tensor) -> list[torch.Tensor]:
+        """What each convolution gives after relu, in the order of `names`: all that `input_gradient` needs."""
         x = image.to(self.compute_dtype).contiguous(memory_format=torch.channels_last)
-        features = []
+        found = []
         for name in self.names:
-            if name.endswith("_1") and name != "conv1_1":
+            if self._follows_pool(name):
                 x = F.avg_pool2d(x, 2)
-            x = F.relu(F.conv2d(x, getattr(self, f"{name}_weight"), getattr(self, f"{name}_bias"), padding=1))
+            x = self._convolve(x, name, "weight", relu=True)
+            found.append(x)
+        return found
+
+    @torch.no_grad()
+    def input_gradient(
+        self, activations: list[torch.Tensor], add_own: Callable[[int, torch.Tensor, torch.Tensor], None]
+    ) -> torch.Tensor:
+        """Gradient (B, 3, H, W) of a loss of the features with respect to the image; `activations` are used up.
+
+        add_own(layer, features, gradient) adds to `gradient`, in place, what the loss itself says of feature layer
+        0..4; it is called from the deepest to the first. No gradient of the weights, no graph: on a processor the
+        passes over memory that those need cost more than the convolutions.
+        """
+        gradient = None
+        layer = len(CONVOLUTIONS[self.backbone])
+        for name in reversed(self.names):
+            x = activations.pop()
+            if gradient is None:
+                gradient = torch.zeros_like(x)
             if name.endswith("_1"):
-                features.append(x)
-        return features
+                layer -= 1
+                add_own(layer, x, gradient)
+            if gradient.shape == x.shape:
+                torch.ops.aten.threshold_backward.grad_input(gradient, x, 0, grad_input=gradient)
+            else:
+                gradient = _through_relu_and_pool(gradient, x)
+            gradient = self._convolve(gradient, name, "turned", relu=False)
+        return gradient
+
+    def _follows_pool(self, name: str) -> bool:
+        return name.endswith("_1") and name != "conv1_1"
+
+    def _convolve(self, x: torch.Tensor, name: str, key: str, relu: bool) -> torch.Tensor:
+        """3x3 convolution, same size; the bias belongs to the way up only."""
+        weight = getattr(self, f"{name}_{key}")
+        bias = getattr(self, f"{name}_bias") if key == "weight" else None
+        if x.device.type == "cpu" and _can_pack():
+            packed_key = (name, key, x.shape[2:])
+            if packed_key not in self._packed:
+                # Packed for one image: for another batch oneDNN could choose another blocking, so other roundings.
+                self._packed[packed_key] = torch._C._nn.mkldnn_reorder_conv2d_weight(
+                    weight.to_mkldnn(), [1, 1], [1, 1], [1, 1], 1, [1, *x.shape[1:]]
+                )
+            after = "relu" if relu else "none"
+            return torch.ops.mkldnn._convolution_pointwise(
+                x, self._packed[packed_key], bias, [1, 1], [1, 1], [1, 1], 1, after, [], ""
+            )
+        x = F.conv2d(x, weight, bias, padding=1)
+        return x.relu_() if relu else x
 
     def carry_masks(self, masks: torch.Tensor) -> list[torch.Tensor]:
         """(B, C, H, W) class masks 0..1 -> the masks at each feature layer: halved at each pool, 3x3 box-averaged at
         each convolution, as in neural doodle (METHOD.md, synthesis details)."""
         carried, m = [], masks.float()
         for name in self.names:
-            if name.endswith("_1") and name != "conv1_1":
+            if self._follows_pool(name):
                 m = F.avg_pool2d(m, 2)
             m = F.avg_pool2d(m, 3, stride=1, padding=1)
             if name.endswith("_1"):
                 carried.append(m)
         return carried
+
+
+@cache
+def _can_pack() -> bool:
+    return torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
+
+
+def _through_relu_and_pool(gradient: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """Gradient of the pool's output (times 1/4, see `turned`), spread over its 2x2 inputs where relu let them pass."""
+    batch, channels, height, width = x.shape
+    if height % 2 or width % 2:  # the pool left out the last row or column
+        spread = F.pad(F.interpolate(gradient, scale_factor=2), (0, width % 2, 0, height % 2))
+        return torch.ops.aten.threshold_backward(spread.contiguous(memory_format=torch.channels_last), x, 0)
+    small = gradient.permute(0, 2, 3, 1).reshape(batch, height // 2, 1, width // 2, 1, channels)
+    large = x.permute(0, 2, 3, 1).reshape(batch, height // 2, 2, width // 2, 2, channels)
+    passed = torch.ops.aten.threshold_backward(small, large, 0)
+    return passed.reshape(batch, height, width, channels).permute(0, 3, 1, 2)
 
 
 def load_vgg(weights_path: Path | None = None, compute_dtype: torch.dtype = torch.float32) -> VggFeatures:

@@ -38,10 +38,19 @@ def add_parser(subparsers) -> None:
     )
     parser.add_argument("--size", type=int, help="height of the images, px; left out: 384 (surface) or 256 (image)")
     parser.add_argument("--seeds", type=int, default=1, help="surface: appearances per texture")
-    parser.add_argument("--iterations", type=int, default=50, help="L-BFGS iterations")
-    parser.add_argument("--batch", type=int, default=1, help="images optimised together")
+    parser.add_argument("--iterations", type=int, default=40, help="L-BFGS iterations, most of them at half the size")
+    parser.add_argument("--batch", type=_batch, default="auto", help="images optimised together, or auto")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
+    parser.add_argument(
+        "--executor",
+        default="local",
+        help="local, or dask://HOST:PORT of a dask scheduler whose workers reach CASE under the same path",
+    )
     parser.set_defaults(run=run)
+
+
+def _batch(text: str) -> int | None:
+    return None if text == "auto" else int(text)
 
 
 def run(args, progress) -> None:
@@ -59,6 +68,11 @@ def run(args, progress) -> None:
         value = getattr(args, name)
         if value is not None and value < least:
             problems.add(f"--{name}: {value}; give at least {least}.")
+    if args.executor != "local":
+        from ..appearances.executors import check_executor
+
+        with problems.collect():
+            check_executor(args.executor)
     problems.raise_if_any()
 
     from ..appearances.contact_sheet import write_contact_sheet
@@ -73,7 +87,7 @@ def run(args, progress) -> None:
         weights = download_vgg19(Path.home() / ".cache" / "expected-appearances")
     if not textures:
         raise InputError(f"{args.textures}: no texture is left after --exclude; leave fewer out.")
-    synthesize_case(
+    distances = synthesize_case(
         case,
         textures,
         progress,
@@ -85,6 +99,9 @@ def run(args, progress) -> None:
         weights,
         args.batch,
         choose_device(args.device),
+        args.executor,
     )
+    listed = ", ".join(f"{name} {distance:.3f}" for name, distance in distances.items())
+    print(f"Gram distance to the texture, mean by class (0: same, fp32): {listed}")
     sheet = write_contact_sheet(case, method, textures)
     print(f"Contact sheet of masks, textures and appearances: {sheet}")

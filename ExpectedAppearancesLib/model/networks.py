@@ -10,9 +10,9 @@ from torch import nn
 class PaperRegressor(nn.Module):
     """The paper's P_Omega: 3 blocks of (conv, conv, ReLU), average pooling after all but the last, then 128-64-32-6."""
 
-    def __init__(self, size_px: int, channels: tuple[int, int, int] = (16, 32, 64)):
+    def __init__(self, size_px: int, channels: tuple[int, int, int] = (16, 32, 64), inputs: int = 3):
         super().__init__()
-        layers, previous = [], 3
+        layers, previous = [], inputs
         for i, width in enumerate(channels):
             layers += [nn.Conv2d(previous, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1), nn.ReLU()]
             layers += [nn.AvgPool2d(2)] if i < len(channels) - 1 else []
@@ -49,7 +49,7 @@ class DenseSurfaceNet(nn.Module):
     these two would cost more than everything else together.
     """
 
-    def __init__(self, width: float = 1.0):
+    def __init__(self, width: float = 1.0, outputs: int = 6):
         super().__init__()
         c = [16 * round(width * n / 16) for n in (48, 96, 160, 224)]
         self.stem = nn.Sequential(nn.PixelUnshuffle(2), _block(12, c[0]), _block(c[0], c[0]))
@@ -61,7 +61,7 @@ class DenseSurfaceNet(nn.Module):
         self.narrow3, self.up3 = nn.Conv2d(c[3], c[2], 1), _block(c[2], c[2])
         self.narrow2, self.up2 = nn.Conv2d(c[2], c[1], 1), _block(c[1], c[1])
         self.narrow1, self.up1 = nn.Conv2d(c[1], c[0], 1), _block(c[0], c[0])
-        self.head = nn.Conv2d(c[0], 6, 1)
+        self.head = nn.Conv2d(c[0], outputs, 1)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         x1 = self.stem(image - 0.5)
@@ -80,5 +80,31 @@ def _twice(x: torch.Tensor) -> torch.Tensor:
     return F.interpolate(x, scale_factor=2.0, mode="nearest")
 
 
-def build_network(estimator: str, size_px: int, width: float) -> nn.Module:
+class SegmentedRegressor(nn.Module):
+    """The paper's rivals (Haouchine et al. 2022): a U-Net segments the vessels, and the pose network reads them.
+
+    reads: 'probability' (ProbSEG) or 'mask', the thresholded one (BinSEG). The two parts learn side by side and apart:
+    the pose network from rendered masks only, as it was published, so that it never sees a segmentation in training.
+    """
+
+    RAMP = 50.0  # the threshold is a ramp 1 / RAMP wide, in logits: rounding then cannot turn a pixel over
+
+    def __init__(self, size_px: int, width: float, reads: str):
+        super().__init__()
+        self.reads = reads
+        self.segmenter = DenseSurfaceNet(width, outputs=1)
+        self.regressor = PaperRegressor(size_px // 2, inputs=1)
+
+    def forward(self, image: torch.Tensor, rendered: torch.Tensor | None = None):
+        """-> (B, 6); given rendered masks (B, 1, S/2, S/2): logits of the vessels, and the pose of those masks."""
+        logits = self.segmenter(image)
+        if rendered is not None:
+            return logits, self.regressor(rendered)
+        binary = self.reads == "mask"
+        return self.regressor((logits * self.RAMP + 0.5).clamp(0, 1) if binary else torch.sigmoid(logits))
+
+
+def build_network(estimator: str, size_px: int, width: float, reads: str = "image") -> nn.Module:
+    if reads != "image":
+        return SegmentedRegressor(size_px, width, reads)
     return PaperRegressor(size_px) if estimator == "regression" else DenseSurfaceNet(width)

@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,17 +17,22 @@ import torch
 from .. import files
 from ..appearances.store import folder_of, read_appearances
 from ..case.case import Case
+from ..case.meshes import write_vtp
 from ..devices import fast_dtype
 from ..evaluation.metrics import add_mm
-from ..masks.stage import craniotomy_of, sampler_of
+from ..masks.exposed import exposed_vessels
+from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
 from ..registration.covariance import CovarianceModel, calibrate_covariance, correlated, pose_error
 from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
+from ..registration.predictor import EXPOSED_VESSELS_NAME
+from ..registration.refinement import VesselAligner
 from . import checkpoint
 from .encoding import PoseEncoding, fit_encoding, network_camera
 from .export import export_model
 from .feeder import Batch, Feeder, ViewMemory, draw_views
-from .losses import dense_loss, regression_loss
+from .fold import Fold
+from .losses import dense_loss, regression_loss, segmentation_loss
 from .networks import build_network
 from .presets import PAPER_EPOCHS, Preset
 from .views import ViewSettings
@@ -43,41 +49,53 @@ def train_case(
     device: torch.device,
     seed: int = 0,
     method: str | None = None,
+    fold: Fold | None = None,
 ) -> dict:
     """Train, calibrate, export to case.model_folder; returns the validation figures that are put on record.
 
     Validation (inner split): poses of another seed and, with 4 textures or more, a texture that is not trained on.
+    fold: train a model of a study into a folder of its own instead; the case's model and manifest stay as they are.
     """
     method, appearances = read_appearances(case, method)
-    styles = sorted({a.style for a in appearances})
-    held_out = styles[len(styles) // 2 :: 8] if len(styles) >= 4 else []
+    styles = fold.styles(method, appearances) if fold else sorted({a.style for a in appearances})
+    inner_split = len(styles) >= 4 and (fold is None or fold.inner_texture)
+    held_out = styles[len(styles) // 2 :: 8] if inner_split else []
     trained_on = [s for s in styles if s not in held_out]
-    if preset.estimator == "regression":
+    if preset.estimator == "regression" and method == "image":
         steps = math.ceil(PAPER_EPOCHS * sum(a.style in trained_on for a in appearances) / preset.batch)
         preset = replace(preset, steps=min(preset.steps, steps))
     views = ViewSettings(
         method, preset.size_px, tuple(trained_on), preset.fresh_poses, preset.negatives, preset.elastic_px, seed + 1
     )
+    if fold and fold.poses_path:
+        views = replace(views, poses_file=str(Path(fold.poses_path).absolute()))
     validation_views = replace(views, styles=tuple(held_out or styles), negatives=0.0, seed=seed + 1001)
     poses = np.stack([sampler_of(case, seed + 1).sample(i) for i in range(400)])
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
-    trainer = _Trainer(case, preset, encoding, device, seed, views)
+    folder = fold.folder if fold else case.model_folder
+    trainer = _Trainer(case, preset, encoding, device, seed, views, folder)
+    made_from = files.sha256(folder_of(case, method) / "index.json")
     progress(0.0, "rendering validation views")
     workers = max(1, (os.cpu_count() or 2) - 1)
     validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
-    case.record("train", preset=preset.to_dict(), seed=seed, styles=trained_on, held_out_styles=held_out, done=False)
+    on_record = {"preset": preset.to_dict(), "seed": seed, "styles": trained_on, "held_out_styles": held_out}
+    if fold is None:
+        case.record("train", **on_record, done=False)
     trainer.run(validation, progress)
     progress(1.0, "calibrating confidence")
     calibration_views = replace(validation_views, negatives=0.3, seed=seed + 2001)
     calibration = draw_views(case.folder, calibration_views, 4 * preset.validation_views, workers)
-    figures = trainer.export(calibration, validation)
-    case.record(
-        "train",
-        done=True,
-        validation=figures,
-        method=method,
-        model_sha256=files.sha256(case.model_folder / "model.onnx"),
-    )
+    figures = trainer.export(calibration, validation, on_record)
+    if fold is None:
+        model_sha256 = files.sha256(case.model_folder / "model.onnx")
+        case.record(
+            "train",
+            done=True,
+            validation=figures,
+            method=method,
+            appearances_sha256=made_from,
+            model_sha256=model_sha256,
+        )
     return figures
 
 
@@ -91,12 +109,20 @@ class _Trainer:
     """Network, optimiser, running average and schedule of one run."""
 
     def __init__(
-        self, case: Case, preset: Preset, encoding: PoseEncoding, device: torch.device, seed: int, views: ViewSettings
+        self,
+        case: Case,
+        preset: Preset,
+        encoding: PoseEncoding,
+        device: torch.device,
+        seed: int,
+        views: ViewSettings,
+        folder: Path,
     ):
+        self.folder = folder
         self.case, self.preset, self.encoding, self.device, self.views = case, preset, encoding, device, views
         self.camera = network_camera(case.camera, preset.size_px)
         torch.manual_seed(seed)
-        network = build_network(preset.estimator, preset.size_px, preset.width).to(device)
+        network = build_network(preset.estimator, preset.size_px, preset.width, preset.reads).to(device)
         self.network = network.to(memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=preset.learning_rate, weight_decay=1e-4, fused=True
@@ -104,6 +130,8 @@ class _Trainer:
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.best = self.average
         craniotomy = craniotomy_of(case)
+        self.exposed = exposed_vessels(case.vessels, parenchyma_of(case, craniotomy), craniotomy.outward_axis)
+        self.aligner = VesselAligner(self.exposed.vertices_mm, self.exposed.triangles, self.camera)
         ranges = sampler_of(case, 0).ranges
         distance = ranges.working_distance_mm
         self.plausible = PlausibleView(
@@ -121,7 +149,7 @@ class _Trainer:
         }
 
     def run(self, validation: Batch, progress: Callable[[float, str], None]) -> None:
-        restored = checkpoint.load(self.case.model_folder, self.network, self.optimizer, self.state["settings"])
+        restored = checkpoint.load(self.folder, self.network, self.optimizer, self.state["settings"])
         if restored:
             self.average, self.best, self.state = restored
             logging.info("resuming at step %d", self.state["step"])
@@ -146,7 +174,7 @@ class _Trainer:
                     group["lr"] = self._learning_rate(done)
                 self.network.train()
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16):
-                    output = self.network(self._images(batch))
+                    output = self.network(self._images(batch), *self._rendered(batch))
                 loss = self._loss(output, batch)
                 self.optimizer.zero_grad(set_to_none=True)
                 loss.backward()
@@ -169,8 +197,9 @@ class _Trainer:
         self._validate(validation, recent)
         self._save()
 
-    def export(self, calibration: Batch, validation: Batch) -> dict:
-        """Calibrate the best network's confidence and write the model; returns its validation figures."""
+    def export(self, calibration: Batch, validation: Batch, on_record: dict) -> dict:
+        """Calibrate the best network's confidence and write the model with what it was trained on; returns its
+        validation figures."""
         self.network.load_state_dict(self.best)
         self.network.eval()
         readings = self._read(calibration)
@@ -198,6 +227,8 @@ class _Trainer:
         meta = {
             "estimator": self.preset.estimator,
             "preset": self.preset.name,
+            "styles": on_record["styles"],
+            "held_out_styles": on_record["held_out_styles"],
             "size_px": self.preset.size_px,
             "camera": self.case.camera.to_dict(),
             "encoding": self.encoding.to_dict(),
@@ -207,22 +238,33 @@ class _Trainer:
             "validation": figures,
             "vessels_sha256": self.case.manifest["inputs"]["vessels"]["sha256"],
         }
-        files.write_json(
-            self.case.model_folder / "training.json", {"curve": self.state["curve"], "validation": figures}
-        )
-        export_model(self.network.cpu(), self.preset, meta, self.case.model_folder)
+        files.write_json(self.folder / "training.json", {"curve": self.state["curve"], "validation": figures})
+        write_vtp(self.folder / EXPOSED_VESSELS_NAME, self.exposed)
+        export_model(self.network.cpu(), self.preset, meta, self.folder)
         return figures
 
     def _images(self, batch: Batch) -> torch.Tensor:
         images = torch.from_numpy(batch.images).to(self.device).permute(0, 3, 1, 2).float() / 255
         return images.contiguous(memory_format=torch.channels_last)
 
-    def _loss(self, output: torch.Tensor, batch: Batch) -> torch.Tensor:
+    def _rendered(self, batch: Batch) -> tuple[torch.Tensor, ...]:
+        """What a network that reads vessel masks is shown besides the image: the rendered ones."""
+        if self.preset.reads == "image":
+            return ()
+        return (torch.from_numpy(batch.vessels).to(self.device)[:, None].float(),)
+
+    def _loss(self, output, batch: Batch) -> torch.Tensor:
+        if self.preset.reads != "image":
+            logits, pose = output
+            return segmentation_loss(logits, self._rendered(batch)[0]) + self._pose_loss(pose, batch)
         if self.preset.estimator == "regression":
-            target = np.stack([self.encoding.encode(pose) for pose in batch.camera_from_world])
-            return regression_loss(output, torch.from_numpy(target).float().to(self.device), self.encoding)
+            return self._pose_loss(output, batch)
         tensors = (torch.from_numpy(a).to(self.device) for a in (batch.points_mm, batch.surface, batch.vessels))
         return dense_loss(output, *tensors, self.encoding)
+
+    def _pose_loss(self, output: torch.Tensor, batch: Batch) -> torch.Tensor:
+        target = np.stack([self.encoding.encode(pose) for pose in batch.camera_from_world])
+        return regression_loss(output, torch.from_numpy(target).float().to(self.device), self.encoding)
 
     def _learning_rate(self, done: float) -> float:
         """The paper's exponential decay for its network; for the dense one a short warm-up, then cosine decay."""
@@ -261,7 +303,7 @@ class _Trainer:
         outputs = np.concatenate([self.network(images[i : i + 32]).cpu().numpy() for i in range(0, len(images), 32)])
         if self.preset.estimator == "regression":
             return [read_regression(output, self.encoding) for output in outputs]
-        return [read_dense(output, self.camera, self.encoding) for output in outputs]
+        return [read_dense(output, self.camera, self.encoding, self.aligner) for output in outputs]
 
     def _add(self, readings: list[Reading], batch: Batch) -> np.ndarray:
         vertices = self.case.vessels.vertices_mm[::20]
@@ -286,4 +328,4 @@ class _Trainer:
         return calibrate_covariance(np.array(errors), fits)
 
     def _save(self) -> None:
-        checkpoint.save(self.case.model_folder, self.network, self.average, self.best, self.optimizer, self.state)
+        checkpoint.save(self.folder, self.network, self.average, self.best, self.optimizer, self.state)

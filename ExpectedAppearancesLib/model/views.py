@@ -24,6 +24,7 @@ from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..poses.sampling import PoseSampler
 from .encoding import network_camera
+from .fold import known_poses, seen_from
 
 COMPOSED_PX = 256  # smaller views are composed at twice their size, then averaged: frames are anti-aliased too
 
@@ -42,7 +43,11 @@ class View:
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """How views are drawn. styles: textures used. negatives: share of views of something else."""
+    """How views are drawn. styles: textures used. negatives: share of views of something else.
+
+    poses_file: views are seen from this file's poses only (the paper's protocol repeats its poses); None: from fresh
+    ones.
+    """
 
     method: str
     size_px: int
@@ -51,6 +56,7 @@ class ViewSettings:
     negatives: float
     elastic_px: float
     seed: int
+    poses_file: str | None = None
 
 
 class ViewSource:
@@ -69,6 +75,9 @@ class ViewSource:
         _, appearances = read_appearances(self.case, settings.method)
         self._appearances = [a for a in appearances if a.style in settings.styles]
         self._images: dict[Path, np.ndarray] = {}
+        self._poses = known_poses(Path(settings.poses_file)) if settings.poses_file else None
+        if self._poses is not None and settings.method == "image":
+            self._appearances = [a for a in self._appearances if seen_from(a, self._poses)]
         self._painter = None
         if settings.method == "surface":
             self._painter = SurfacePainter(self.case.vessels, parenchyma, self._appearances)
@@ -90,13 +99,15 @@ class ViewSource:
     def view(self, index: int) -> View:
         rng = np.random.default_rng([self.settings.seed, 7, index])
         if self._painter:
-            pose = self._sampler.sample(index)
+            seen = self._poses
+            pose = self._sampler.sample(index) if seen is None else seen[rng.integers(len(seen))]
             labels, depth_mm, points = self._renderer.render_surface(pose)
             image = self._painter.paint(labels, depth_mm, self._painter.overview_px(points), pose, rng)
             cortex = self._painter.cortex(rng)
         else:
             appearance = self._appearances[rng.integers(len(self._appearances))]
-            turn = self._camera_turn(appearance.camera_from_world, rng) if self.settings.fresh_poses else np.eye(3)
+            fresh = self.settings.fresh_poses and self._poses is None
+            turn = self._camera_turn(appearance.camera_from_world, rng) if fresh else np.eye(3)
             pose = pose_from_rotation(turn, np.zeros(3)) @ appearance.camera_from_world
             labels, _, points = self._renderer.render_surface(pose)
             image = self._turned(appearance, turn)

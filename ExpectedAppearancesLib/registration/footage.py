@@ -12,7 +12,9 @@ import numpy as np
 from .. import files
 from ..errors import InputError, Problems
 
-VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv"})
+VIDEO_SUFFIXES = frozenset(
+    (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv")
+)
 LARGEST_RATE_HZ = 1000.0  # containers without a frame rate report 0, or their clock's ticks
 
 

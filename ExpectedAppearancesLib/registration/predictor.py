@@ -10,14 +10,17 @@ import cv2
 import numpy as np
 
 from .. import files
+from ..case.meshes import read_mesh
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..model.encoding import PoseEncoding, network_camera
 from .confidence import Confidence
 from .covariance import CovarianceModel
 from .decoding import PlausibleView, read_dense, read_regression
+from .refinement import VesselAligner
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2: the vessels lie beside the model, poses are refined on them
+EXPOSED_VESSELS_NAME = "exposed_vessels.vtp"
 ASPECT_TOLERANCE = 0.01
 
 
@@ -43,10 +46,11 @@ class Predictor:
 
         folder = Path(model_folder)
         meta = files.read_json(folder / "model.json", "trained model")
-        if not isinstance(meta, dict) or meta.get("format_version", FORMAT_VERSION + 1) > FORMAT_VERSION:
-            raise InputError(
-                f"{folder / 'model.json'}: made by a newer version; update ExpectedAppearances or train again."
-            )
+        version = meta.get("format_version") if isinstance(meta, dict) else None
+        if version != FORMAT_VERSION:
+            older = isinstance(version, int) and version < FORMAT_VERSION
+            way_out = "an older version; train again" if older else "a newer version; update ExpectedAppearances"
+            raise InputError(f"{folder / 'model.json'}: made by {way_out}.")
         path = folder / "model.onnx"
         if not path.is_file():
             raise InputError(f"{path}: trained model missing; run `train` first.")
@@ -69,12 +73,15 @@ class Predictor:
         self.plausible = PlausibleView.from_dict(meta["plausible_view"])
         self.confidence = Confidence.from_dict(meta["confidence"])
         self.covariance = CovarianceModel.from_dict(meta.get("covariance"))
+        if self.estimator == "dense":
+            vessels = read_mesh(folder / EXPOSED_VESSELS_NAME, "vessels of the trained model")
+            self.aligner = VesselAligner(vessels.vertices_mm, vessels.triangles, self.camera)
         self._maps: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
 
     @property
     def gives_covariance(self) -> bool:
         """False for a direct regression whose training calibrated none."""
-        return self.estimator != "regression" or self.covariance.fixed is not None
+        return self.estimator != "regression" or bool(self.covariance.shared.any())
 
     def predict(self, image_rgb: np.ndarray, camera: Camera | None = None) -> Prediction:
         """Pose of a frame uint8 (H, W, 3) taken by `camera` (the case's if None; A is scaled to the frame's size).
@@ -88,7 +95,7 @@ class Predictor:
         if self.estimator == "regression":
             reading = read_regression(output, self.encoding)
         else:
-            reading = read_dense(output, self.camera, self.encoding)
+            reading = read_dense(output, self.camera, self.encoding, self.aligner)
         confidence = self.confidence.probability(reading.evidence)
         pose = reading.camera_from_world
         accepted = pose is not None and confidence >= self.confidence.threshold and self.plausible.holds(pose)

@@ -1,0 +1,50 @@
+"""The class-wise Gram distance of a finished image to its texture, always measured in the same way."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..textures.library import CLASS_NAMES, Texture
+from .gram import ClassTerm, class_masks, rows_of, texture_grams
+from .images import resized, to_vgg_input
+from .vgg import VggFeatures
+
+CLASSES = tuple(CLASS_NAMES)
+KEPT_TEXTURES = 4  # images come texture by texture; more would only take memory
+
+
+class GramMeasure:
+    """Distances in fp32, of the image as it is saved (8 bit), whatever it was optimised in and with."""
+
+    def __init__(self, vgg: VggFeatures):
+        """vgg: with float32 weights."""
+        self.vgg = vgg
+        self._targets: dict[tuple, list[torch.Tensor]] = {}
+
+    @torch.no_grad()
+    def distances(self, image_rgb: np.ndarray, labels: np.ndarray, texture: Texture) -> dict[str, float]:
+        """By class name: the squared distance of the Grams of RGB uint8 (H, W, 3) inside the class to the texture's,
+        over the squared norm of the texture's, summed over the five layers. Classes not shown are left out.
+        """
+        device = self.vgg.conv1_1_weight.device
+        targets = self._target(texture, *labels.shape)
+        masks = self.vgg.carry_masks(class_masks(torch.from_numpy(labels)[None].to(device), CLASSES))
+        features = self.vgg(to_vgg_input(image_rgb)[None].to(device))
+        found = {}
+        for index, c in enumerate(CLASSES):
+            terms = [ClassTerm.of(m[:, index], t[None, index], torch.float32) for m, t in zip(masks, targets)]
+            if any(terms) and not torch.isnan(targets[0][index]).any():
+                found[CLASS_NAMES[c]] = sum(float(t.add(rows_of(f), None)) for t, f in zip(terms, features) if t)
+        return found
+
+    def _target(self, texture: Texture, height: int, width: int) -> list[torch.Tensor]:
+        key = (texture.name, height, width)
+        if key not in self._targets:
+            image, labels = resized(texture, height, width)
+            device = self.vgg.conv1_1_weight.device
+            tensors = to_vgg_input(image).to(device), torch.from_numpy(labels).to(device)
+            self._targets[key] = texture_grams(self.vgg, *tensors, CLASSES)
+            while len(self._targets) > KEPT_TEXTURES:
+                del self._targets[next(iter(self._targets))]
+        return self._targets[key]

@@ -1,0 +1,73 @@
+"""What synthesis costs: operations and memory of an image, and how many images fit in what is free."""
+
+from __future__ import annotations
+
+import torch
+
+from .vgg import CONVOLUTIONS, WIDTHS
+
+# Ends nearer to the texture than 50 iterations from noise at full size, the paper's (docs/benchmarks.md).
+DEFAULT_ITERATIONS = 40
+# Most iterations are spent at half the size, at a quarter of the cost; these stay for the full size.
+FINE_SHARE = 0.4
+LEAST_COARSE_PX = 64
+PIXELS_AT_ONCE = 2**17  # through the network on a processor: larger tensors are given anew by the system every time
+SHARE_OF_FREE = 0.5  # others compute here too
+# Measured with `torch.cuda.max_memory_allocated`'s equivalent on a processor (peak resident memory): the history of
+# L-BFGS, 2 x 3 x 4 bytes a pixel and pair, and besides it about this much; it does not depend on the texture.
+BYTES_PER_PIXEL = 2600
+VECTORS = 12  # of an image's size, in fp32, that an iteration holds besides the history
+
+
+def fine_and_coarse(shape: tuple[int, int], iterations: int) -> tuple[int, int]:
+    """Iterations at full size and at half the size."""
+    fine = max(1, round(FINE_SHARE * iterations))
+    if min(shape) < 2 * LEAST_COARSE_PX:
+        fine = iterations
+    return fine, iterations - fine
+
+
+def bytes_per_image(shape: tuple[int, int], iterations: int) -> int:
+    """Memory that one more image in the batch takes: history and vectors of the larger of both levels."""
+    pixels = shape[0] * shape[1]
+    fine, coarse = fine_and_coarse(shape, iterations)
+    pairs = max(fine, coarse / 4)
+    return int(pixels * 3 * 4 * (2 * min(pairs, 100) + VECTORS))
+
+
+def images_at_once(shape: tuple[int, int], iterations: int, device: torch.device) -> int:
+    """How many images (H, W) to optimise together: what fits in half of the free memory, and on a processor no more
+    than go through the network together, since more would gain nothing."""
+    pixels = shape[0] * shape[1]
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        each = bytes_per_image(shape, iterations) + BYTES_PER_PIXEL * pixels
+        return max(1, int(SHARE_OF_FREE * free / each))
+    import psutil
+
+    free = psutil.virtual_memory().available - BYTES_PER_PIXEL * max(pixels, PIXELS_AT_ONCE)
+    fitting = int(SHARE_OF_FREE * free / bytes_per_image(shape, iterations))
+    return max(1, min(fitting, PIXELS_AT_ONCE // pixels))
+
+
+def operations_per_evaluation(shape: tuple[int, int], backbone: str, class_shares: tuple[float, ...]) -> float:
+    """Floating-point operations (2 per multiply-add) of one loss and gradient: the convolutions, once up and once
+    down to the image, and the Gram matrices and their gradients on each class's share of the pixels. What is
+    proportional to pixels times channels only (relu, pools, L-BFGS) is left out."""
+    pixels, operations, before = float(shape[0] * shape[1]), 0.0, 3
+    for block, (count, width) in enumerate(zip(CONVOLUTIONS[backbone], WIDTHS, strict=True)):
+        if block:
+            pixels /= 4
+        for _ in range(count):
+            operations += 2 * (2 * 9 * before * width * pixels)
+            before = width
+        operations += 2 * (2 * pixels * sum(class_shares) * width * width)
+    return operations
+
+
+def operations_per_image(
+    shape: tuple[int, int], backbone: str, class_shares: tuple[float, ...], iterations: int
+) -> float:
+    fine, coarse = fine_and_coarse(shape, iterations)
+    one = operations_per_evaluation(shape, backbone, class_shares)
+    return one * (fine + 1) + (one / 4 * (coarse + 1) if coarse else 0.0)

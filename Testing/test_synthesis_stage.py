@@ -1,0 +1,193 @@
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import Counter
+
+import numpy as np
+import pytest
+from cases import texture, write_inputs
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.appearances import claims, store
+from ExpectedAppearancesLib.appearances.claims import ClaimLost, Claims
+from ExpectedAppearancesLib.appearances.stage import synthesize_case
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.cli import main
+from ExpectedAppearancesLib.errors import CancelledError, InputError
+from ExpectedAppearancesLib.masks.stage import render_case
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
+
+
+def records(folder) -> list[str]:
+    """Every image that was finished, as often as it was."""
+    lines = [line for path in folder.glob("finished/*.jsonl") for line in path.read_text().splitlines() if line]
+    return [json.loads(line)["image"] for line in lines]
+
+
+@pytest.fixture
+def case(tmp_path):
+    paths = write_inputs(tmp_path)
+    case = Case.create(tmp_path / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
+    render_case(case, lambda *_: None, poses=3)
+    return case
+
+
+@pytest.mark.parametrize("method", ["surface", "image"])
+def test_a_killed_synthesis_goes_on_and_ends_as_if_it_had_not_been(case, method):
+    textures = [texture("a"), texture("b", (200, 180, 40))]
+
+    def cancel_in_second(fraction, _message):
+        if fraction > 0.6:
+            raise CancelledError("stop")
+
+    with pytest.raises(CancelledError):
+        synthesize_case(case, textures, cancel_in_second, method, size_px=48, iterations=4)
+    with pytest.raises(InputError, match="not finished"):
+        store.read_appearances(case, method)
+    folder = store.folder_of(case, method)
+    kept = {p.name: p.stat().st_mtime_ns for p in folder.glob("*.png") if "labels" not in p.name}
+    assert kept
+    synthesize_case(case, textures, lambda *_: None, method, size_px=48, iterations=4)
+    _, resumed = store.read_appearances(case, method)
+    assert len(resumed) == (2 if method == "surface" else 3)
+    for name, stamp in kept.items():
+        assert (folder / name).stat().st_mtime_ns == stamp
+    images = {a.image_path.name: files.read_image_rgb(a.image_path) for a in resumed}
+    for path in (*folder.glob("finished/*"), folder / "index.json"):
+        path.unlink()
+    synthesize_case(case, textures, lambda *_: None, method, size_px=48, iterations=4)
+    for appearance in store.read_appearances(case, method)[1]:
+        np.testing.assert_array_equal(files.read_image_rgb(appearance.image_path), images[appearance.image_path.name])
+
+
+def test_a_changed_texture_or_axis_is_not_passed_over(case):
+    def made(textures):
+        synthesize_case(case, textures, lambda *_: None, "surface", size_px=32, iterations=1)
+        return {a.style: a.image_path.stat().st_mtime_ns for a in store.read_appearances(case, "surface")[1]}
+
+    first = made([texture("a"), texture("b")])
+    assert made([texture("a"), texture("b")]) == first
+    second = made([texture("a"), texture("b", (10, 200, 10))])
+    assert second["a"] == first["a"] and second["b"] != first["b"]
+    render_case(case, lambda *_: None, 3, craniotomy=find_craniotomy(case.vessels, normal=[0.3, 0, 1]))
+    third = made([texture("a"), texture("b", (10, 200, 10))])
+    assert third["a"] != second["a"] and third["b"] != second["b"]
+
+
+def test_paper_preset_makes_every_pose_with_every_texture(case):
+    textures = [texture("a"), texture("b")]
+    synthesize_case(case, textures, lambda *_: None, "image", size_px=32, iterations=1, every_texture=True)
+    _, appearances = store.read_appearances(case, "image")
+    assert len(appearances) == 6 and {a.style for a in appearances} == {"a", "b"}
+
+
+def test_a_synthesis_killed_by_the_system_loses_no_finished_image(case, tmp_path):
+    for name in "abcdef":
+        files.write_png(tmp_path / "textures" / f"{name}.png", texture(name, size=96).image)
+    files.write_png(tmp_path / "textures" / "labels.png", texture(size=96).labels)
+    arguments = [str(case.folder), "--textures", str(tmp_path / "textures"), "--size", "48", "--iterations", "25"]
+    process = subprocess.Popen([sys.executable, "-m", "ExpectedAppearancesLib", "synthesize", *arguments])
+    folder = store.folder_of(case, "surface")
+    deadline = time.monotonic() + 120
+    while not (folder / "b-0.png").is_file() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    kept = set(records(folder))
+    assert kept and not store.read_index(case, "surface")["done"]
+    stamps = {name: (folder / name).stat().st_mtime_ns for name in kept}
+    assert main(["synthesize", *arguments]) == 0
+    assert len(store.read_appearances(case, "surface")[1]) == 6
+    assert {name: (folder / name).stat().st_mtime_ns for name in kept} == stamps
+
+
+def test_what_a_kill_left_half_written_is_made_again(case):
+    textures = [texture("a"), texture("b")]
+    synthesize_case(case, textures, lambda *_: None, "surface", size_px=32, iterations=1)
+    folder = store.folder_of(case, "surface")
+    whole = {name: (folder / name).read_bytes() for name in ("a-0.png", "b-0.png")}
+    record = folder / "finished" / "a-00000.jsonl"
+    record.write_bytes(record.read_bytes()[:-20])
+    (folder / "b-0.png").write_bytes(whole["b-0.png"][:-9])
+    synthesize_case(case, textures, lambda *_: None, "surface", size_px=32, iterations=1)
+    assert {name: (folder / name).read_bytes() for name in whole} == whole
+    _, appearances = store.read_appearances(case, "surface")
+    assert {a.style for a in appearances} == {"a", "b"}
+
+
+def test_gram_distance_is_in_the_index_the_sheet_and_the_output(case, tmp_path, capsys):
+    files.write_png(tmp_path / "textures" / "a.png", texture(size=96).image)
+    files.write_png(tmp_path / "textures" / "labels.png", texture(size=96).labels)
+    arguments = [str(case.folder), "--textures", str(tmp_path / "textures"), "--size", "48", "--iterations", "2"]
+    assert main(["synthesize", *arguments]) == 0
+    (item,) = store.read_index(case, "surface")["items"]
+    assert set(item["gram_distance_by_class"]) == {"parenchyma", "vessels"}
+    assert item["gram_distance"] == pytest.approx(sum(item["gram_distance_by_class"].values()), abs=2e-4)
+    assert f"parenchyma {item['gram_distance_by_class']['parenchyma']:.3f}" in capsys.readouterr().out
+    sheet = files.read_image_rgb(store.folder_of(case, "surface") / "contact_sheet.png")
+    assert (sheet[:22] < 128).any() and (sheet[22:44, :400] < 128).any()  # the lines with the figures
+
+
+def test_a_claim_has_one_holder_until_it_is_released(tmp_path):
+    first = Claims(tmp_path).take("a-00000")
+    assert first and Claims(tmp_path).take("a-00000") is None
+    assert Claims(tmp_path).take("a-00001") is not None
+    first.check()
+    first.release()
+    assert Claims(tmp_path).take("a-00000") is not None
+
+
+def test_a_claim_of_a_dead_process_is_taken_over_once(tmp_path):
+    script = (
+        "import os, sys; from ExpectedAppearancesLib.appearances.claims import Claims; "
+        "assert Claims(sys.argv[1]).take('a'); print('held', flush=True); sys.stdin.read()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert process.stdout.readline().strip() == b"held"
+    assert Claims(tmp_path).take("a") is None
+    process.kill()
+    process.wait()
+    process.stdin.close()
+    process.stdout.close()
+    heirs = [Claims(tmp_path).take("a") for _ in range(3)]
+    assert [heir is not None for heir in heirs] == [True, False, False]
+
+
+def test_a_silent_holder_on_another_machine_is_given_up_and_told_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(claims, "_own_identity", lambda: {"machine": "other", "pid": 1, "started": 0.0})
+    holder = Claims(tmp_path).take("a")
+    monkeypatch.undo()
+    here = Claims(tmp_path)
+    assert here.take("a") is None
+    clock = time.monotonic() + claims.STALE_S - 1
+    monkeypatch.setattr(claims.time, "monotonic", lambda: clock)
+    assert here.take("a") is None
+    os.utime(tmp_path / "a.0.json", ns=(1, 1))  # a sign of life, whatever its clock says
+    clock += 10
+    assert here.take("a") is None
+    clock += claims.STALE_S + 1
+    heir = here.take("a")
+    assert heir is not None
+    with pytest.raises(ClaimLost, match="taken over"):
+        holder.keep()
+    here.withdraw("a")
+    with pytest.raises(ClaimLost, match="cancelled"):
+        heir.check()
+
+
+def test_two_runs_on_one_case_share_the_work(case, tmp_path):
+    for name in "abcd":
+        files.write_png(tmp_path / "textures" / f"{name}.png", texture(name, size=96).image)
+    files.write_png(tmp_path / "textures" / "labels.png", texture(size=96).labels)
+    arguments = [str(case.folder), "--textures", str(tmp_path / "textures"), "--size", "48", "--iterations", "6"]
+    command = [sys.executable, "-m", "ExpectedAppearancesLib", "synthesize", *arguments]
+    processes = [subprocess.Popen(command) for _ in range(2)]
+    assert [process.wait(timeout=300) for process in processes] == [0, 0]
+    folder = store.folder_of(case, "surface")
+    assert Counter(records(folder)) == {f"{name}-0.png": 1 for name in "abcd"}
+    assert len(store.read_appearances(case, "surface")[1]) == 4
+    assert not list(folder.glob("claims/*"))
