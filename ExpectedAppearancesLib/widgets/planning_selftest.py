@@ -397,7 +397,7 @@ def _events(seconds: float) -> None:
         time.sleep(0.005)
 
 
-def _wait(test, condition, seconds: float = 30.0) -> None:
+def _wait(test, condition, seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         test.assertLess(time.monotonic(), end, "waited too long")
