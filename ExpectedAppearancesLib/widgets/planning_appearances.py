@@ -52,7 +52,7 @@ class AppearancesSection(Section):
         if self.panel.runs["train"].active:
             problem = _("The model is being trained; cancel that first.")
         index = self.panel.recorded.index
-        self.controls.refresh(problem, unfinished=bool(index and not index["done"]))
+        self.controls.refresh(problem, unfinished=bool(index and not index["done"]), said=step.text)
         self._show_newest(p)
 
     def close(self) -> None:

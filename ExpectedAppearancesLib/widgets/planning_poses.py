@@ -78,7 +78,7 @@ class PosesSection(Section):
             blocked = self.step.text
         elif self.panel.steps["case"].state.value == "stale":
             blocked = _("Save the case first: {reason}").format(reason=self.panel.steps["case"].text)
-        self.controls.refresh(blocked, unfinished=False)
+        self.controls.refresh(blocked, unfinished=False, said=self.step.text)
 
     def _show_automatic(self, p, sampler) -> None:
         """What the automatic ranges come to, in the disabled fields."""

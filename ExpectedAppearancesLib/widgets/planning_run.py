@@ -82,8 +82,8 @@ class RunControls:
         self._start, self._cancel, self._bar, self._label = start_button, cancel_button, bar, label
         self._start_hint, self._noun = start_hint, noun
 
-    def refresh(self, problem: str, unfinished: bool) -> None:
-        """problem: why no run can begin, '' if nothing is in the way."""
+    def refresh(self, problem: str, unfinished: bool, said: str = "") -> None:
+        """problem: why no run can begin, '' if nothing is in the way. said: what the section's status line says."""
         status = self.watch.status
         state = controls(status.state, problem, unfinished)
         allow(self._start, state.start, self._start_hint)
@@ -93,7 +93,7 @@ class RunControls:
             self._start.text = text
         self._bar.visible = self.watch.active
         self._bar.value = round(100 * status.fraction)
-        self._label.text = _line(status)
+        self._label.text = _line(status) or (problem if problem != said else "")
         self._label.visible = bool(self._label.text)
 
 

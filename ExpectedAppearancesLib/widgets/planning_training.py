@@ -62,7 +62,7 @@ class TrainingSection(Section):
         problem = problem or self.panel.help.reason("training")
         if self.panel.runs["synthesize"].active:
             problem = _("Expected appearances are being made; wait until they are ready.")
-        self.controls.refresh(problem, unfinished=self._unfinished())
+        self.controls.refresh(problem, unfinished=self._unfinished(), said=self.step.text)
         curve = self._curve(self.session.case(p))
         allow(
             ui.showLossButton, "" if curve else _("Nothing has been trained yet."), _("Show the plot of loss and ADD.")
