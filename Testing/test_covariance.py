@@ -65,14 +65,14 @@ def test_calibrated_covariance_is_consistent_where_residuals_are_correlated():
     assert distances.mean() == pytest.approx(6, rel=0.2)
     assert (distances > chi2.ppf(0.95, 6)).mean() < 0.11 and (distances < chi2.ppf(0.5, 6)).mean() < 0.62
     # One common error for all residuals is the worst case, and what a model without calibration gets.
-    assert model.scale < UNCALIBRATED.scale and CovarianceModel.from_dict(None) == UNCALIBRATED
+    assert model.scale < UNCALIBRATED.scale and CovarianceModel.from_dict(None) is UNCALIBRATED
 
 
 def test_covariance_is_about_the_cases_centre_in_camera_axes():
     """Against poses drawn from the fit's own covariance, about its points' centre, far from the case's centre."""
     rng = np.random.default_rng(3)
     spread = np.diag([0.01, 0.02, 0.03, 0.2, 0.3, 1.0])
-    fit = PoseFit(view(4), spread @ spread, 1.0, 1.0, CENTRE + np.array([25.0, -10.0, 3.0]), 50)
+    fit = PoseFit(view(4), CENTRE + np.array([25.0, -10.0, 3.0]), spread @ spread, 1.0, 1.0, 50)
     errors = []
     for _ in range(4000):
         drawn = spread @ rng.normal(size=6)
@@ -101,13 +101,13 @@ def test_poses_without_fits_have_the_spread_of_their_errors():
     errors[:4] *= 15
     model = calibrate_covariance(errors, None)
     size = np.sqrt(np.diag(spread @ spread.T))
-    np.testing.assert_allclose(model.fixed / np.outer(size, size), spread @ spread.T / np.outer(size, size), atol=0.15)
+    np.testing.assert_allclose(model.shared / np.outer(size, size), spread @ spread.T / np.outer(size, size), atol=0.15)
     again = CovarianceModel.from_dict(json.loads(json.dumps(model.to_dict())))
-    np.testing.assert_array_equal(again.covariance(None, CENTRE), model.fixed)
+    np.testing.assert_array_equal(again.covariance(None, CENTRE), model.shared)
     assert UNCALIBRATED.covariance(None, CENTRE) is None
 
 
 def test_few_views_calibrate_nothing():
     errors, fits, _ = simulated(8, 7)
-    assert calibrate_covariance(errors, fits) == UNCALIBRATED
-    assert calibrate_covariance(np.zeros((0,)), np.zeros((0,))) == UNCALIBRATED
+    assert calibrate_covariance(errors, fits) is UNCALIBRATED
+    assert calibrate_covariance(np.zeros((0,)), np.zeros((0,))) is UNCALIBRATED

@@ -47,6 +47,21 @@ def test_video_gives_its_frames_in_rgb_with_their_times(video):
         np.testing.assert_allclose(frame.read_rgb()[40, 40], [level, level // 2, 60], atol=6)
 
 
+@pytest.mark.parametrize(("suffix", "codec"), [(".avi", "MJPG"), (".mp4", "mp4v")])
+def test_a_written_frame_can_be_read_again(tmp_path, suffix, codec):
+    path = tmp_path / f"v{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, (96, 96))
+    for level in LEVELS:
+        writer.write(np.ascontiguousarray(grey(level)[..., ::-1]))
+    writer.release()
+    for number in (13, 0, 19):
+        image = files.read_image_rgb(tmp_path / f"v{suffix}#frame={number}")
+        np.testing.assert_allclose(image[40, 40], grey(LEVELS[number])[0, 0], atol=6)
+    for wrong in (f"v{suffix}#frame=20", f"v{suffix}#frame=x", f"w{suffix}#frame=1"):
+        with pytest.raises(InputError, match=wrong):
+            files.read_image_rgb(tmp_path / wrong)
+
+
 def test_a_given_rate_replaces_the_videos_and_times_images(video, tmp_path):
     assert [f.time_s for f in Footage([video], 50.0)][:3] == pytest.approx([0, 0.02, 0.04])
     paths = [tmp_path / f"{i}.png" for i in (2, 1)]

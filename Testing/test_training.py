@@ -202,7 +202,7 @@ def test_trained_model_registers_frames_of_any_size_and_colour(trained, tmp_path
     frame = json.loads(out.read_text())["frames"][0]
     assert frame["image"] == "ä b.png" and frame["accepted"] is False
     assert {"confidence", "rotation_vector_rad", "translation_mm", "latency_ms", "camera_from_world"} <= frame.keys()
-    assert meta["covariance"].keys() == {"scale", "fixed"} and "covariance" in frame
+    assert meta["covariance"].keys() == {"shared", "scale"} and "covariance" in frame
 
 
 def test_every_bad_frame_is_listed_and_nothing_is_written(trained, tmp_path, capsys):

@@ -20,32 +20,33 @@ LEFT_OUT = 0.02  # share of views, the worst: lost ones are for the confidence t
 
 @dataclass(frozen=True)
 class CovarianceModel:
-    """scale: of the covariance of a fit as if all its residuals were one and the same error. fixed (6, 6), or None: the
-    covariance of a pose that is regressed without a fit.
+    """covariance = shared + scale x covariance of the fit as if all its residuals were one and the same error.
 
-    A network's residuals in one frame are all but one error: as if independent, they are tens of times too small.
+    shared (6, 6): what every view errs by; all there is for a pose that is regressed without a fit. A network's
+    residuals are all but one error: their covariance as if independent is tens of times too small.
     """
 
+    shared: np.ndarray
     scale: float
-    fixed: np.ndarray | None = None
 
     def covariance(self, fit: PoseFit | None, centre_world_mm: np.ndarray) -> np.ndarray | None:
-        """(6, 6); None where nothing is known: of a regressor without calibration."""
-        return self.fixed if fit is None else self.scale * correlated(fit, centre_world_mm)
+        """(6, 6); None where nothing is known, for a regressor whose training calibrated none."""
+        if fit is None:
+            return self.shared if self.shared.any() else None
+        return self.shared + self.scale * correlated(fit, centre_world_mm)
 
     def to_dict(self) -> dict:
-        return {"scale": self.scale, "fixed": None if self.fixed is None else self.fixed.tolist()}
+        return {"shared": self.shared.tolist(), "scale": self.scale}
 
     @staticmethod
     def from_dict(values: dict | None) -> CovarianceModel:
         """None: a model from before calibration; its residuals are then taken for one common error, the worst case."""
         if values is None:
             return UNCALIBRATED
-        fixed = values["fixed"]
-        return CovarianceModel(float(values["scale"]), None if fixed is None else np.array(fixed, float))
+        return CovarianceModel(np.array(values["shared"], float), float(values["scale"]))
 
 
-UNCALIBRATED = CovarianceModel(1.0)
+UNCALIBRATED = CovarianceModel(np.zeros((6, 6)), 1.0)
 
 
 def correlated(fit: PoseFit, centre_world_mm: np.ndarray) -> np.ndarray:
@@ -71,12 +72,12 @@ def calibrate_covariance(errors: np.ndarray, fits: np.ndarray | None) -> Covaria
     if len(errors) < LEAST_VIEWS:
         return UNCALIBRATED
     if fits is not None:
-        return CovarianceModel(_excess(_normalised(errors, fits)))
-    fixed = errors.T @ errors / len(errors)
-    kept = errors[np.argsort(_normalised(errors, fixed))[: _kept(len(errors))]]
+        return CovarianceModel(np.zeros((6, 6)), _excess(_normalised(errors, fits)))
+    shared = errors.T @ errors / len(errors)
+    kept = errors[np.argsort(_normalised(errors, shared))[: _kept(len(errors))]]
     # Once more without the worst, which would stand for hundreds of good ones.
-    fixed = kept.T @ kept / len(kept)
-    return CovarianceModel(1.0, fixed * _excess(_normalised(errors, fixed)))
+    shared = kept.T @ kept / len(kept)
+    return CovarianceModel(shared * _excess(_normalised(errors, shared)), 1.0)
 
 
 def _normalised(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -12,7 +12,10 @@ import numpy as np
 from .. import files
 from ..errors import InputError, Problems
 
-VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv"})
+VIDEO_SUFFIXES = frozenset(
+    (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv")
+)
+FRAME_MARK = "#frame="  # parts a video's path from the number of one of its frames
 LARGEST_RATE_HZ = 1000.0  # containers without a frame rate report 0, or their clock's ticks
 
 
@@ -60,20 +63,10 @@ class Footage:
             time_s = None if self._rate_hz is None else i / self._rate_hz
             yield FootageFrame(path, time_s, lambda path=path: files.read_image_rgb(path))
 
-    def _open(self):
-        import cv2
-
-        path = self._paths[0]
-        capture = cv2.VideoCapture(str(path))
-        if not capture.isOpened():
-            capture.release()
-            raise InputError(f"{path}: not a video that OpenCV can read (or damaged); save it as MP4 (H.264) or AVI.")
-        return capture
-
     def _video_count(self) -> int:
         import cv2
 
-        capture = self._open()
+        capture = _open(self._paths[0])
         count, rate_hz = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
         capture.release()
         if self._rate_hz is None and not 0 < rate_hz <= LARGEST_RATE_HZ:
@@ -83,7 +76,7 @@ class Footage:
     def _video_frames(self) -> Iterator[FootageFrame]:
         import cv2
 
-        path, capture = self._paths[0], self._open()
+        path, capture = self._paths[0], _open(self._paths[0])
         interval_s = 1 / (self._rate_hz or capture.get(cv2.CAP_PROP_FPS))
         try:
             number, time_s = 0, -interval_s
@@ -96,9 +89,37 @@ class Footage:
                 following = self._rate_hz is None and math.isfinite(stamp_s) and stamp_s > time_s
                 time_s = stamp_s if following else time_s + interval_s
                 rgb = np.ascontiguousarray(image[..., ::-1])
-                yield FootageFrame(path.with_name(f"{path.name}#frame={number}"), time_s, lambda rgb=rgb: rgb)
+                yield FootageFrame(path.with_name(f"{path.name}{FRAME_MARK}{number}"), time_s, lambda rgb=rgb: rgb)
                 number += 1
         finally:
             capture.release()
         if number == 0:
             raise InputError(f"{path}: no frame of this video can be read; save it again as MP4 (H.264) or AVI.")
+
+
+def read_video_frame(path: Path) -> np.ndarray:
+    """The frame that a path VIDEO#frame=N names, uint8 RGB (H, W, 3). Raises InputError."""
+    import cv2
+
+    video, _, number = str(path).rpartition(FRAME_MARK)
+    if not number.isdecimal() or not Path(video).is_file():
+        raise InputError(f"{path}: video not found; check the path.")
+    capture = _open(Path(video))
+    try:
+        capture.set(cv2.CAP_PROP_POS_FRAMES, int(number))
+        found, image = capture.read()
+    finally:
+        capture.release()
+    if not found:
+        raise InputError(f"{path}: the video has no such frame; register it again.")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def _open(path: Path):
+    import cv2
+
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        capture.release()
+        raise InputError(f"{path}: not a video that OpenCV can read (or damaged); save it as MP4 (H.264) or AVI.")
+    return capture

@@ -81,7 +81,7 @@ class Predictor:
     @property
     def gives_covariance(self) -> bool:
         """False for a direct regression whose training calibrated none."""
-        return self.estimator != "regression" or self.covariance.fixed is not None
+        return self.estimator != "regression" or bool(self.covariance.shared.any())
 
     def predict(self, image_rgb: np.ndarray, camera: Camera | None = None) -> Prediction:
         """Pose of a frame uint8 (H, W, 3) taken by `camera` (the case's if None; A is scaled to the frame's size).

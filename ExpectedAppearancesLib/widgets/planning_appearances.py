@@ -9,8 +9,8 @@ import qt
 from slicer.i18n import tr as _
 
 from ..case.steps import StepState
+from ..gpus import device_arguments
 from ..textures.library import LABELS_SUFFIX
-from .planning_devices import device_arguments
 from .planning_run import RunControls, started
 from .planning_section import Section
 
