@@ -143,7 +143,7 @@ class ExpectedAppearancesParameterNode:
 
     method: Method = Method.SURFACE
     sizePx: Annotated[int, WithinRange(32, 2048)] = 384
-    iterations: Annotated[int, WithinRange(1, 1000)] = 50
+    iterations: Annotated[int, WithinRange(1, 1000)] = 40
 
     preset: TrainingPreset = TrainingPreset.QUICK
     device: str = "auto"  # or "cpu", or "cuda:N"

@@ -92,7 +92,7 @@ class ExpectedAppearancesLiveParameterNode:
     repeat: bool = False
     onlyNew: bool = False
     rateHz: Annotated[float, WithinRange(0.1, 100)] = 25.0
-    longestPx: Annotated[int, WithinRange(256, 4096)] = 1280
+    longestPx: Annotated[int, WithinRange(256, 4096)] = 960
     staleMs: Annotated[int, WithinRange(50, 60000)] = 500
     outline: bool = True
     fill: bool = True

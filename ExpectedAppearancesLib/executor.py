@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 import uuid
 from collections.abc import Callable, Sequence
@@ -10,8 +11,8 @@ from collections.abc import Callable, Sequence
 from .errors import CancelledError, InputError
 
 LOCAL = "local"
-SCHEME = "dask://"
-CONNECT_S = 15.0
+_ADDRESS = re.compile(r"dask://(?P<host>\[[0-9a-fA-F:]+\]|[^/:\s]+):(?P<port>\d{1,5})/?")
+CONNECT_S = 15  # that a scheduler is given to answer
 STOP_S = 60.0  # that workers are given to end what they do
 ASK_EVERY_S = 2.0  # how often a worker asks whether it should stop
 
@@ -21,13 +22,31 @@ Work = Callable[[object, ProgressFunction, Callable[[], bool]], None]
 
 
 def check_executor(executor: str) -> None:
-    """Raise InputError unless it is 'local', or 'dask://HOST:PORT' with a scheduler that answers."""
+    """Raise InputError for anything but 'local' and 'dask://HOST:PORT', or where dask is missing."""
     if executor == LOCAL:
         return
-    host, _, port = executor.removeprefix(SCHEME).rpartition(":")
-    if not executor.startswith(SCHEME) or not host or not port.isdecimal():
-        raise InputError(f"--executor: '{executor}' is not known; give local, or dask://HOST:PORT of a dask scheduler.")
-    _connect(executor).close()
+    if not _ADDRESS.fullmatch(executor):
+        raise InputError(f"--executor: '{executor}' is not known; give local or dask://HOST:PORT of a dask scheduler.")
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "--executor: dask.distributed is not installed; run: pip install 'expected-appearances[cluster]'"
+        ) from None
+
+
+def connect(executor: str):
+    """distributed.Client of 'dask://HOST:PORT'; close it. Raises InputError where no scheduler answers."""
+    from distributed import Client, TimeoutError
+
+    address = "tcp://" + executor.removeprefix("dask://").rstrip("/")
+    try:
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, TimeoutError) as error:
+        raise InputError(
+            f"--executor: no dask scheduler answers at {address} ({error}); start one with `dask scheduler`, "
+            "or leave --executor out."
+        ) from error
 
 
 def run_jobs(jobs: Sequence, work: Work, executor: str, progress: ProgressFunction) -> None:
@@ -42,9 +61,9 @@ def run_jobs(jobs: Sequence, work: Work, executor: str, progress: ProgressFuncti
         return
     if not jobs:
         return
-    from dask.distributed import Event, as_completed, wait
+    from distributed import Event, TimeoutError, as_completed, wait
 
-    with _connect(executor) as client:
+    with connect(executor) as client, client.as_current():
         stop = f"expected-appearances-{uuid.uuid4()}"
         event = Event(stop, client=client)
         futures = [client.submit(_on_worker, work, job, stop, pure=False, retries=0) for job in jobs]
@@ -61,7 +80,7 @@ def run_jobs(jobs: Sequence, work: Work, executor: str, progress: ProgressFuncti
 
 def _on_worker(work: Work, job, stop: str) -> None:
     """Runs on a worker of the cluster."""
-    from dask.distributed import Event
+    from distributed import Event
 
     event, asked_s, answer = Event(stop), -ASK_EVERY_S, False
 
@@ -74,18 +93,3 @@ def _on_worker(work: Work, job, stop: str) -> None:
     if stopped():
         raise CancelledError("stopped before it began")
     work(job, lambda _fraction, _text: None, stopped)
-
-
-def _connect(executor: str):
-    try:
-        from dask.distributed import Client
-    except ImportError as error:
-        raise InputError(
-            "--executor: dask.distributed is not installed; run: pip install 'expected-appearances[cluster]'"
-        ) from error
-    try:
-        return Client(f"tcp://{executor.removeprefix(SCHEME)}", timeout=CONNECT_S)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(
-            f"--executor: no dask scheduler answers at {executor}; start one (`dask scheduler`), or give local."
-        ) from error

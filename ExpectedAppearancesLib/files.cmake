@@ -67,6 +67,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/geometry/pose.py
   ExpectedAppearancesLib/geometry/se3.py
   ExpectedAppearancesLib/geometry/silhouette.py
+  ExpectedAppearancesLib/gpus.py
   ExpectedAppearancesLib/live/__init__.py
   ExpectedAppearancesLib/live/alignment.py
   ExpectedAppearancesLib/live/choice.py

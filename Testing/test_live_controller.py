@@ -101,11 +101,11 @@ def test_three_hundred_frames_each_with_its_own_pose_and_nothing_left_over(appli
     poses, images = frames
     view = SliceView(scene, logic, "Microscope", (320, 240))
     through = ThreeDView(scene, logic, "MicroscopeCamera", (160, 120))
-    views = LiveViews(view.node, view.composite, lambda: (through.camera_node, (160, 120)))
+    views = LiveViews(view.node, view.composite, lambda: (through.node, through.camera_node, (160, 120)))
     before = scene.GetNumberOfNodes()
     stream = node_with(scene, images[0])
     controller = LiveController(scene, views)
-    controller.start(choice_of(phantom), model=model)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
     counts, resident = [], []
     for number in range(300):
         if number % 25 == 24:
@@ -265,7 +265,7 @@ def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(app
     scene, _logic = application
     stream = node_with(scene, frames[1][0])
     controller = LiveController(scene)
-    controller.start(choice_of(phantom), model=model)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
     wait_for(controller, lambda s: s.new)
     controller.start_recording()
     send(stream, frames[1][1])
@@ -275,7 +275,7 @@ def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(app
     assert not [t for t in _threads() if "ExpectedAppearances" in t]
     after_close = scene.GetNumberOfNodes()
     node_with(scene, frames[1][2])
-    controller.start(choice_of(phantom), model=model)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     controller.close()
     scene.RemoveNode(scene.GetFirstNodeByName("Stream"))
@@ -333,6 +333,24 @@ def test_replay_of_a_saved_scene_gives_the_same_frames_and_poses(application, ph
             np.testing.assert_allclose(camera_to_ras_of(again.live.transform), expected, atol=1e-6)
     again.close()
     assert live_record.recordings(loaded)
+
+
+def test_a_loaded_scene_shows_its_last_frame_without_overlay(application, phantom, model, frames):
+    scene, _logic = application
+    node_with(scene, frames[1][3])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    kept = controller.live
+    pixels, matrix, camera = shown_pixels(kept), camera_to_ras_of(kept.transform), kept.camera
+    controller.forget_scene()  # as after loading: the nodes are there, the session is not
+    again = LiveController(scene)
+    assert again.restore(phantom.case.folder, camera)
+    np.testing.assert_array_equal(shown_pixels(again.live), pixels)
+    np.testing.assert_allclose(again.live.camera_to_ras, matrix)
+    assert not again.live.overlay_visible and again.live.plane_mm == pytest.approx(kept.plane_mm)
+    again.close()
+    assert not LiveController(scene).restore(phantom.case.folder, camera)
 
 
 def test_a_recording_of_another_case_shows_no_overlay(application, phantom, model, frames, tmp_path):

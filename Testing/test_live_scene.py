@@ -95,7 +95,7 @@ def shown(application, case, size=(640, 480), options=None):
 
 
 def draw(view, live, fit=True):
-    live_views.align_slice(view.node, live.camera, live.camera_to_ras, live.plane_mm)
+    live_views.align_slice(view.node, live.camera, live.camera_to_world, live.plane_mm)
     if fit:
         live_views.fit_slice(view.node, live.camera, live.plane_mm)
     live.set_view_pixel(live_views.view_pixel_mm(view.node))
@@ -114,6 +114,39 @@ def test_outline_lies_within_a_pixel_of_the_projected_silhouette(application, ca
     # The frame itself is shown pixel for pixel.
     same = np.abs(pixels.astype(int) - result.image_rgb).max(axis=2) <= 1
     assert same[~cv2.dilate(drawn.astype(np.uint8), np.ones((3, 3))).astype(bool)].mean() > 0.999
+
+
+def test_outline_and_view_hold_when_the_user_transforms_the_models(application, case):
+    import vtk
+
+    scene, logic = application
+    view, live, _result = shown(application, case)
+    moved = vtk.vtkTransform()
+    moved.Translate(40, -25, 60)
+    moved.RotateWXYZ(50, 1, 2, -0.5)
+    node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Patient moved")
+    node.SetMatrixTransformToParent(moved.GetMatrix())
+    for model in live.models.values():
+        model.SetAndObserveTransformNodeID(node.GetID())
+    live.show(result_of(case, OTHER_POSE, seed=1))
+    draw(view, live)
+    drawn = is_colour(view.pixels(), PREDICTED_RGB)
+    far_px, near_px = apart(case, OTHER_POSE, CAMERA, drawn)
+    assert drawn.sum() > 500 and far_px.max() <= 1.0 and near_px.max() < 1.5
+    # The vessels themselves, where they lie now, are seen there too.
+    through = ThreeDView(scene, logic, "MicroscopeCamera", (640, 480))
+    for each in (*live.lines.values(), live.frustum, live.models["Cortex"]):
+        each.GetDisplayNode().SetVisibility(False)
+    vessels = live.models["Vessels"].GetDisplayNode()
+    vessels.SetColor(1, 1, 1)
+    vessels.SetLighting(False)
+    through.node.SetBackgroundColor(0, 0, 0)
+    through.node.SetBackgroundColor2(0, 0, 0)
+    through.window.Render()
+    live_views.aim_camera(through.camera_node, (640, 480), CAMERA, live.camera_to_world, live.plane_mm)
+    seen = through.pixels().min(axis=2) > 128
+    expected = OverlayMaker(case.vessels).make(CAMERA, OTHER_POSE).fill.astype(bool)
+    assert (seen & expected).sum() / (seen | expected).sum() > 0.97
 
 
 def test_outline_stays_on_the_vessels_when_a_new_pose_comes(application, case):
@@ -192,6 +225,48 @@ def test_view_through_the_camera_shows_the_vessels_where_the_frame_has_them(appl
     assert (drawn_in_frame & expected).sum() / (drawn_in_frame | expected).sum() > 0.97
     live_views.look_away(view.camera_node)
     assert not (view.pixels().min(axis=2) > 128).any()
+
+
+def test_view_through_the_camera_has_the_frame_behind_the_vessels(application, case):
+    scene, logic = application
+    live = LiveScene(scene, case)
+    result = result_of(case)
+    result.image_rgb[:] = cv2.GaussianBlur(result.image_rgb, None, 3)
+    result.image_rgb[:40, :60] = (0, 0, 255)
+    live.show(result)
+    view = ThreeDView(scene, logic, "MicroscopeCamera", (640, 480))
+    other = ThreeDView(scene, logic, "MicroscopeOverview", (64, 48))
+    live.show_backdrop(view.node.GetID())
+    for node in (*live.models.values(), *live.lines.values(), live.frustum):
+        node.GetDisplayNode().SetVisibility(False)
+    for one in (view, other):
+        one.window.Render()
+        live_views.aim_camera(one.camera_node, one.window.GetSize(), CAMERA, live.camera_to_ras, live.plane_mm)
+        one.node.SetBackgroundColor(0, 1, 0)
+        one.node.SetBackgroundColor2(0, 1, 0)
+    pixels = view.pixels()
+    assert np.abs(pixels.astype(int) - result.image_rgb)[5:-5, 5:-5].mean() < 2
+    assert (other.pixels() == [0, 255, 0]).all()
+    live.show(result_of(case, accepted=False))
+    live.show_backdrop(view.node.GetID())
+    assert (view.pixels() == [0, 255, 0]).all()
+
+
+def test_banner_is_read_over_the_view_and_goes_without_a_trace(application, case):
+    from ExpectedAppearancesLib.mrml.live_banner import Banner
+
+    view, _live, _result = shown(application, case)
+    before = view.pixels()
+    banner = Banner(view.renderer)
+    assert banner.say("NO OVERLAY", (0.75, 0.08, 0.1))
+    assert not banner.say("NO OVERLAY", (0.75, 0.08, 0.1))
+    pixels = view.pixels()
+    red = is_colour(pixels, (0.75, 0.08, 0.1))
+    assert red[2].all() and red[-3].all() and red[:, 2].all() and red[:, -3].all()
+    assert (pixels[8:60] > 200).all(axis=2).any()  # white letters
+    np.testing.assert_array_equal(pixels[80:400, 20:620], before[80:400, 20:620])
+    banner.remove()
+    np.testing.assert_array_equal(view.pixels(), before)
 
 
 def test_a_frame_of_another_size_is_shown_whole_and_true(application, case):

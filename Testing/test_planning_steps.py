@@ -140,7 +140,7 @@ STEEPER = {**POSES, "ranges": RANGES | {"tilt_max_deg": 60.0}}
         (lambda c, r: (replace(c, synthesis={"size_px": 256}), r), "appearances", STALE, "size"),
         (lambda c, r: (c, replace(r, overview_changed=True)), "appearances", STALE, "craniotomy"),
         (lambda c, r: (c, replace(r, index=None)), "appearances", READY, "start"),
-        (lambda c, r: (c, replace(r, index=index(done=False))), "appearances", READY, "6 made"),
+        (lambda c, r: (c, replace(r, index=index(done=False))), "appearances", READY, "goes on"),
         (lambda c, r: (c, without(r, "render")), "appearances", MISSING, "label maps"),
         (lambda c, r: (replace(c, running=frozenset({"synthesize"})), r), "appearances", RUNNING, "made"),
         # Training
@@ -252,7 +252,7 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     recorded = reader.recorded(folder, "surface", Limits())
     assert recorded.model
     assert recorded.verdict == (False, ("unknown accepted, at least 50 % wanted",))
-    files.write_json(case.folder / "study" / "study.json", study() | {"appearances_sha256": "b"})
+    files.write_json(case.folder / "study" / "study.json", study() | {"inputs": {"appearances_sha256": "b"}})
     assert reader.recorded(folder, "surface", Limits()).validation == "stale"
     (case.folder / "vessels.vtp").write_text("other")
     files.write_json(case.folder / "case.json", json.loads((case.folder / "case.json").read_text()) | {"created": ""})

@@ -84,6 +84,7 @@ def test_what_the_pose_network_reads():
     image, seen = torch.rand(1, 3, 64, 64), []
     for reads in ("probability", "mask"):
         network = SegmentedRegressor(64, 0.4, reads).eval()
+        network.segmenter.head.weight.data *= 100  # as sure of itself as a trained one
         network.regressor.register_forward_pre_hook(lambda _module, inputs: seen.append(inputs[0].detach()))
         with torch.no_grad():
             network(image)

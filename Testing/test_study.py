@@ -24,8 +24,10 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, ExpectedAppearancesError, InputError
 from ExpectedAppearancesLib.evaluation import study, study_folds
+from ExpectedAppearancesLib.evaluation.verdict import figures_of_study
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
+from ExpectedAppearancesLib.registration.predictor import Prediction
 
 SHIFT_MM = {"a": 1.0, "b": 2.0, "c": 4.0}
 QUICK = study.StudySettings(protocols=("strict",), steps=5)
@@ -49,6 +51,7 @@ if (here / "fail").exists():
 folder.mkdir(parents=True, exist_ok=True)
 (folder / "model.onnx").write_text("model of " + folder.name)
 figures = {"steps": 5, "seconds": 1.0, "add_mm_mean": 2.0}
+(folder / "checkpoint.safetensors").write_text("")
 (folder / "training.json").write_text(json.dumps({"validation": figures}))
 """
 
@@ -64,9 +67,9 @@ class ShiftedPredictor:
         self.frames = read_poses(self.known)[1]
 
     def predict(self, image_rgb, _camera):
-        frame = self.frames[int(image_rgb[0, 0, 0])]
+        frame = self.frames[int(image_rgb[0, 0, 0]) % len(self.frames)]
         pose = pose_from_rotation(np.eye(3), (SHIFT_MM[frame.style], 0, 0)) @ frame.camera_from_world
-        return SimpleNamespace(camera_from_world=pose, accepted=frame.style != "c", confidence=0.5, latency_ms=7.0)
+        return Prediction(pose, frame.style != "c", 0.5, 7.0)
 
 
 def make_case(folder: Path, styles: str = "abc") -> tuple[Path, Path]:
@@ -103,6 +106,13 @@ def studied(tmp_path, monkeypatch):
     return SimpleNamespace(case=case_folder, poses=poses, trainer=trainer, out=tmp_path / "out")
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Pictures are most of a study's time here, and some tests look at none."""
+    monkeypatch.setattr(study, "_write_overlays", lambda *_: None)
+    monkeypatch.setattr("ExpectedAppearancesLib.evaluation.study_report.write_study_report", lambda *_: None)
+
+
 def calls(studied) -> list[list[str]]:
     path = studied.trainer / "calls.txt"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
@@ -127,9 +137,11 @@ def test_figures_of_both_protocols_are_those_computed_by_hand(studied):
         assert curve["add_auc_20mm"] == pytest.approx(1 - 7 / 60)
         shares = dict(zip(curve["limits"], curve["add"]))
         assert shares == {n: pytest.approx(sum(s < n for s in (1, 2, 4)) / 3) for n in np.arange(81) / 4}
+    assert len(figures_of_study(result)) == 2 * (1 + 3)  # what the planning panel shows
     made = {(words[words.index("--exclude") + 1], "--poses" in words) for words in calls(studied)}
     assert made == {(style, repeats) for style in "abc" for repeats in (False, True)}
     assert all(words[0] == "train" and words[words.index("--steps") + 1] == "5" for words in calls(studied))
+    assert not list(studied.case.rglob("checkpoint.safetensors"))
     assert (studied.case / "case.json").read_bytes() == before and not (studied.case / "model").exists()
 
 
@@ -144,7 +156,18 @@ def test_report_is_one_file_with_its_pictures(studied):
         assert files.read_image_rgb(studied.out / name).std() > 5
 
 
-def test_a_finished_fold_is_trained_again_only_when_what_it_depends_on_changed(studied):
+def test_cases_that_are_called_alike_keep_apart_in_one_report(studied, tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "_write_overlays", lambda *_: None)
+    other, poses = make_case(tmp_path / "other")
+    pairs = [(studied.case, studied.poses), (other, poses)]
+    results = study.run_study(pairs, studied.out, replace(QUICK, styles=("a", "b")))
+    assert [set(r["protocols"]["strict"]["per_style"]) for r in results] == [{"a", "b"}] * 2
+    assert set(json.loads((studied.out / "study.json").read_text())) == {f"{tmp_path.name}/case", "other/case"}
+    assert "other/case, quick, strict" in (studied.out / "report.html").read_text(encoding="utf-8")
+    assert len(calls(studied)) == 4 and study.read_study(other) == results[1]
+
+
+def test_a_finished_fold_is_trained_again_only_when_what_it_depends_on_changed(studied, no_pictures):
     both = replace(QUICK, protocols=("strict", "loto"))
     run(studied, both)
     run(studied, both)
@@ -160,7 +183,7 @@ def test_a_finished_fold_is_trained_again_only_when_what_it_depends_on_changed(s
     assert len(calls(studied)) == 16
 
 
-def test_later_parts_are_added_to_the_study_and_other_inputs_begin_a_new_one(studied):
+def test_later_parts_are_added_to_the_study_and_other_inputs_begin_a_new_one(studied, no_pictures):
     run(studied)
     run(studied, replace(QUICK, presets=("paper",)))
     result = run(studied, replace(QUICK, protocols=("loto",), presets=("quick",)))
@@ -221,9 +244,9 @@ def test_a_stopped_fold_leaves_no_process_and_says_what_it_did(studied):
     job, heard = some_job(studied), []
     with pytest.raises(CancelledError):
         study_folds.train_fold(
-            job, lambda fraction, text: heard.append((fraction, text)), lambda: (0.6, "step 2") in heard
+            job, lambda fraction, text: heard.append((fraction, text)), lambda: (0.6, "quick-strict-a: step 2") in heard
         )
-    assert (0.5, "step 1, loss 0.5 (3 s left)") in heard
+    assert (0.5, "quick-strict-a: step 1, loss 0.5") in heard
     assert not alive(int((studied.trainer / "pid").read_text())) and not study_folds.is_trained(job)
 
 
@@ -329,5 +352,5 @@ def test_a_failing_job_of_a_cluster_stops_the_others(cluster, tmp_path):
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
     pytest.importorskip("dask.distributed", reason="dask.distributed is not installed")
     monkeypatch.setattr(executor, "CONNECT_S", 0.5)
-    with pytest.raises(InputError, match=r"no dask scheduler answers at dask://127\.0\.0\.1:9"):
-        executor.check_executor("dask://127.0.0.1:9")
+    with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        executor.connect("dask://127.0.0.1:9")

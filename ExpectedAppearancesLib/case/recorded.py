@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
+from ..appearances.store import METHODS
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
 from .case import MANIFEST_NAME, Case
@@ -40,7 +41,7 @@ class CaseReader:
         index_path = case.appearances_folder / method / "index.json"
         index, index_sha256 = self._once(index_path, _read_index) or (None, "")
         model = self._once(case.model_folder / "model.json", _read_object)
-        rows, stale = self.figures(case, model)
+        rows, stale = self.figures(case)
         state = self._once(case.model_folder / "checkpoint.safetensors", training_state) or {}
         return Recorded(
             "",
@@ -55,9 +56,9 @@ class CaseReader:
             verdict(rows, limits) if rows else None,
         )
 
-    def figures(self, case: Case, model: dict | None = None) -> tuple[list[Figures], bool]:
-        """Rows of the validation table, study first, and whether they belong to an older model."""
-        model = model or self._once(case.model_folder / "model.json", _read_object)
+    def figures(self, case: Case) -> tuple[list[Figures], bool]:
+        """Rows of the validation table, study first, and whether the study is about older appearances."""
+        model = self._once(case.model_folder / "model.json", _read_object)
         rows: list[Figures] = []
         study = self._once(case.folder / "study" / "study.json", _read_object)
         stale = False
@@ -66,11 +67,9 @@ class CaseReader:
                 rows = figures_of_study(study)
             except InputError:
                 rows = []
-            used, now = study.get("appearances_sha256"), self._once(case.folder / MANIFEST_NAME, self._open)
-            trained_on = (
-                now[0].manifest["stages"].get("train", {}).get("appearances_sha256") if now and now[0] else None
-            )
-            stale = bool(rows and used and trained_on and used != trained_on)
+            used = (study.get("inputs") or {}).get("appearances_sha256")
+            indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
+            stale = bool(rows and used) and used not in [index[1] for index in indices if index]
         if model:
             rows = rows + figures_of_model(model)
         return rows, stale

@@ -219,7 +219,7 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
     if not stages.get("render", {}).get("done"):
         return Step(StepState.MISSING, "Draw the label maps first (Craniotomy and poses).")
     index = recorded.index
-    if not index or not index["items"]:
+    if not index:
         if not chosen.textures:
             return Step(StepState.MISSING, "Choose textures first.")
         return Step(StepState.READY, "All is there: start.")
@@ -232,12 +232,11 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
     if index["done"]:
         textures = changes_of_textures(chosen.textures, index)
         changed += textures if len(textures) <= 2 else ["the textures"]
-    made = len(index["items"])
     if changed:
         return Step(StepState.STALE, f"Changed since they were made: {_listed(changed)}. Start makes what is missing.")
     if not index["done"]:
-        return Step(StepState.READY, f"Stopped with {made} made; start goes on where it was.")
-    return Step(StepState.DONE, f"{_counted(made, 'expected appearance')} made.")
+        return Step(StepState.READY, "Stopped; start goes on where it was.")
+    return Step(StepState.DONE, f"{_counted(len(index['items']), 'expected appearance')} made.")
 
 
 def _training(chosen: Chosen, recorded: Recorded) -> Step:

@@ -17,10 +17,12 @@ from ..case.case import Case
 from ..case.meshes import Mesh, write_vtp
 from ..geometry.camera import Camera
 from ..geometry.pose import apply_to_vtk_camera, look_at, transform
+from ..masks.exposed import exposed_vessels
 from ..model.encoding import PoseEncoding
 from ..poses.craniotomy import find_craniotomy
 from ..registration.confidence import Confidence
 from ..registration.decoding import EVIDENCE
+from ..registration.predictor import EXPOSED_VESSELS_NAME, FORMAT_VERSION
 from .vessel_tree import generate_case_meshes
 
 NETWORK = Path(__file__).with_name("phantom.onnx")
@@ -225,7 +227,7 @@ def _write_model(case: Case) -> None:
     confidence = Confidence(np.zeros(count), np.ones(count), weights, -2.5, 0.8)
     files.write_bytes(case.model_folder / "model.onnx", NETWORK.read_bytes())
     meta = {
-        "format_version": 1,
+        "format_version": FORMAT_VERSION,
         "model_sha256": files.sha256(case.model_folder / "model.onnx"),
         "estimator": "dense",
         "preset": "phantom",
@@ -241,4 +243,6 @@ def _write_model(case: Case) -> None:
         "confidence": confidence.to_dict(),
         "vessels_sha256": case.manifest["inputs"]["vessels"]["sha256"],
     }
+    exposed = exposed_vessels(case.vessels, case.cortex, craniotomy.outward_axis)
+    write_vtp(case.model_folder / EXPOSED_VESSELS_NAME, exposed)
     files.write_json(case.model_folder / "model.json", meta)

@@ -25,9 +25,10 @@ from .curves import curve_points
 from .evaluate import Evaluation, check_out, compare, known_frames, overlay_images, register_frames
 from .metrics import add_auc, add_mm
 from .overlays import choose_frames, sheet
-from .study_folds import PROTOCOLS, FoldJob, is_trained, train_fold
+from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
+from .verdict import STUDY_FORMAT
 
-FORMAT, FORMAT_VERSION = "ExpectedAppearances study", 1
+FORMAT_VERSION = 1
 LEFT_OUT = 3  # textures of the number-of-textures study that no model is trained on
 TEXTURE_COUNTS = range(3, 13)
 CURVE_STEP = 0.25  # mm and degrees between the points of the curves
@@ -90,6 +91,9 @@ def run_study(
     studied = _check(pairs, out_folder, settings)
     jobs = [job for one in studied for job in _jobs(one, settings)]
     waiting = [job for job in jobs if not is_trained(job)]
+    for one in studied:
+        count = sum(job.case_folder == str(one.case.folder) for job in waiting)
+        files.require_space(one.folder, count * SPACE_MB["fold"] + SPACE_MB["under way"])
     progress(0.0, f"{len(waiting)} of {len(jobs)} models are to be trained")
     run_jobs(waiting, train_fold, settings.executor, lambda f, text: progress(TRAINING_SHARE * f, text))
 
@@ -112,7 +116,11 @@ def read_study(case_folder: Path) -> dict | None:
     if not path.is_file():
         return None
     values = files.read_json(path, "study")
-    if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("presets"), dict):
+    if (
+        not isinstance(values, dict)
+        or values.get("format") != STUDY_FORMAT
+        or not isinstance(values.get("presets"), dict)
+    ):
         raise InputError(f"{path}: not the result of a study; run `study` again.")
     if not isinstance(values.get("format_version"), int) or values["format_version"] > FORMAT_VERSION:
         raise InputError(f"{path}: made by a newer version; update ExpectedAppearances, or run `study` again.")
@@ -256,7 +264,12 @@ def _begin(one: StudyCase, settings: StudySettings) -> dict:
         before = None
     if before and before.get("inputs") == one.inputs:
         return before
-    study = {"format": FORMAT, "format_version": FORMAT_VERSION, "case": one.case.folder.name, "inputs": one.inputs}
+    study = {
+        "format": STUDY_FORMAT,
+        "format_version": FORMAT_VERSION,
+        "case": one.case.folder.name,
+        "inputs": one.inputs,
+    }
     distances = nearest_other_pose_add_mm(one.case.vessels.vertices_mm, [f.camera_from_world for f in one.frames])
     study["nearest_other_pose_add_mm"] = float(np.mean(distances)) if len(distances) else None
     return study | {"presets": {}, "preset": settings.presets[0], "protocols": {}, "thresholds": {}}

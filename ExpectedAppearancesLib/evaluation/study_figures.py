@@ -33,7 +33,7 @@ def write_study_curves(path: Path, thresholds: Mapping[str, Mapping]) -> None:
 def write_texture_bars(path: Path, per_style: Mapping[str, Mapping[str, Mapping]]) -> None:
     """Mean ADD on each left-out texture, one bar for each label: per_style[label][style] = metrics."""
     styles = sorted({style for figures in per_style.values() for style in figures})
-    figure = new_figure(max(7, 1.5 + len(styles) * max(0.6, 0.22 * len(per_style))), 4.2)
+    figure = new_figure(min(14, max(7, 1.5 + len(styles) * max(0.6, 0.16 * len(per_style)))), 4.2)
     axes = figure.subplots()
     width = 0.82 / len(per_style)
     for i, (label, figures) in enumerate(per_style.items()):

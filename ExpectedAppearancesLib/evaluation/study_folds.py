@@ -19,7 +19,8 @@ from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, CancelledError, ExpectedApp
 PROTOCOLS = ("strict", "loto")
 COMMAND = (sys.executable, "-m", "ExpectedAppearancesLib")
 PATIENCE_S = 30.0  # that a stopped training is given to save what it has
-_PROGRESS = re.compile(r"^\s*(\d+) %  (.*)$")
+_PROGRESS = re.compile(r"^\s*(\d+) %  (.*?)(?: \([^()]* left\))?$")  # the time left is the fold's, not the study's
+SPACE_MB = {"fold": 60.0, "under way": 400.0}  # of a finished fold, and of a training with its checkpoint
 
 
 @dataclass(frozen=True)
@@ -101,13 +102,14 @@ def train_fold(
                 shown += 1
                 match = _PROGRESS.match(line)
                 if match:
-                    progress(int(match[1]) / 100, match[2])
+                    progress(int(match[1]) / 100, f"{job.name}: {match[2]}")
             time.sleep(0.2)
     finally:
         _end(process)
     reader.join(5)
     _check_exit(job, process.returncode, said)
     model_sha256 = files.sha256(job.folder / "model.onnx")
+    (job.folder / "checkpoint.safetensors").unlink(missing_ok=True)  # several times the model's size, of use no more
     files.write_json(job.folder / "fold.json", {"settings": job.settings, "done": True, "model_sha256": model_sha256})
 
 

@@ -185,9 +185,13 @@ def _shown_robustness(case_folder: Path, table: dict) -> dict:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """A name for each case: its folder's, with the whole path where two are called alike."""
-    short = [Path(folder).name for folder in folders]
-    return [name if short.count(name) == 1 else str(folder) for name, folder in zip(short, folders)]
+    """A name for each case: its folder's, with as many of the folders above as tell all apart."""
+    parts = [Path(folder).parts for folder in folders]
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(part[-depth:]) for part in parts]
+        if len(set(names)) == len(names):
+            break
+    return names
 
 
 def _baselines(name: str, study: dict) -> list[tuple[str, str, str]]:

@@ -45,6 +45,7 @@ class OverlayMaker:
         self._edge_of_side = self._edge_of_side.ravel()
         a, b, c = (vessels.vertices_mm[vessels.triangles[:, i]] for i in range(3))
         self._normals, self._first_mm = np.cross(b - a, c - a), a
+        self._is_closed = bool((np.bincount(self._edge_of_side) == 2).all())
         low, high = vessels.vertices_mm.min(axis=0), vessels.vertices_mm.max(axis=0)
         sides = list(itertools.product((0, 1), repeat=3))
         self._corners_mm = np.where(sides, high, low)
@@ -78,10 +79,9 @@ class OverlayMaker:
         points_px = _pixels(small, near)
         centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
         towards = np.einsum("ij,ij->i", self._normals, centre_mm - self._first_mm) > 0
-        # A closed surface needs only one of the two; one with holes is seen from within through them.
-        seen = self._covered(points_px, towards & in_front, small) | self._covered(
-            points_px, ~towards & in_front, small
-        )
+        seen = self._covered(points_px, towards & in_front, small)
+        if not (self._is_closed and in_front.all()):  # through holes one sees the other side
+            seen |= self._covered(points_px, ~towards & in_front, small)
         return seen.astype(np.uint8)
 
     def _covered(self, points_px: np.ndarray, used: np.ndarray, camera: Camera) -> np.ndarray:
@@ -99,7 +99,7 @@ def winding(edges_px: np.ndarray, weight: np.ndarray, width: int, height: int) -
 
     weight (E,): how often each edge counts. What lies outside the frame is cut off, not drawn at its side.
     """
-    changes = np.zeros((height, width + 1), np.int16)
+    changes = np.zeros(height * (width + 1), np.int16)
     (x0, y0), (x1, y1) = edges_px[:, 0].T, edges_px[:, 1].T
     first = np.clip(np.ceil(np.minimum(y0, y1)), 0, height).astype(np.int64)
     rows = np.clip(np.ceil(np.maximum(y0, y1)), 0, height).astype(np.int64) - first
@@ -107,8 +107,10 @@ def winding(edges_px: np.ndarray, weight: np.ndarray, width: int, height: int) -
     row = first[which] + np.arange(len(which)) - np.repeat(np.cumsum(rows) - rows, rows)
     slope = (x1 - x0)[which] / (y1 - y0)[which]
     column = np.clip(np.ceil(x0[which] + (row - y0[which]) * slope), 0, width).astype(np.int64)
-    np.add.at(changes, (row, column), (np.sign(y1 - y0)[which] * np.rint(weight)[which]).astype(np.int16))
-    return np.cumsum(changes[:, :-1], axis=1, dtype=np.int16)
+    sign = (np.sign(y1 - y0)[which] * np.rint(weight)[which]).astype(np.int16)
+    np.add.at(changes, row * (width + 1) + column, sign)
+    # In one run over all rows: each row's changes cancel, since outlines are closed.
+    return np.cumsum(changes, dtype=np.int16).reshape(height, width + 1)[:, :-1]
 
 
 def _pixels(camera: Camera, points_camera_mm: np.ndarray) -> np.ndarray:

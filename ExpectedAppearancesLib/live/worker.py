@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -97,6 +98,7 @@ class NewestWins(Generic[Task, Result]):
             try:
                 result = self._process(task)
             except BaseException as error:
+                logging.getLogger(__name__).exception("The registration of a frame failed")
                 self.failure = error
             finally:
                 task = None  # a frame must not live on here until the next one comes

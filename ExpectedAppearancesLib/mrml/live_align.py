@@ -8,7 +8,7 @@ from ..case.case import Case
 from ..geometry.pose import RAS_FROM_LPS, inverse, transform
 from ..live.alignment import LandmarkPose, pose_from_landmarks
 from . import scene as scenes
-from .live_scene import ROLE_ATTRIBUTE, LiveScene
+from .live_scene import ROLE_ATTRIBUTE, LiveScene, matrix_of
 
 HANDLES, FRAME_LANDMARKS, MESH_LANDMARKS = "handles", "landmarks in frame", "landmarks on mesh"
 
@@ -43,7 +43,7 @@ class Alignment:
     @property
     def camera_from_world(self) -> np.ndarray:
         """The pose at which the camera would see the vessels as they lie now."""
-        moved_from_ras = _matrix(self.handles)
+        moved_from_ras = matrix_of(self.handles)
         world_from_ras = inverse(self._ras_from_world)
         return self._start @ world_from_ras @ moved_from_ras @ self._ras_from_world
 
@@ -101,11 +101,3 @@ def _points(markups, world: bool) -> np.ndarray:
         (markups.GetNthControlPointPositionWorld if world else markups.GetNthControlPointPosition)(i, position)
         points.append(position)
     return np.array(points, float).reshape(-1, 3)
-
-
-def _matrix(transform_node) -> np.ndarray:
-    from vtkmodules.vtkCommonMath import vtkMatrix4x4
-
-    matrix = vtkMatrix4x4()
-    transform_node.GetMatrixTransformToParent(matrix)
-    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])

@@ -25,7 +25,7 @@ from ..live.trust import Sight, Verdict
 from ..poses.craniotomy import find_craniotomy
 from . import live_record
 from .live_align import Alignment, pose_of_landmarks
-from .live_scene import LiveScene, OverlayOptions, remove_live_nodes
+from .live_scene import FRAME, LiveScene, OverlayOptions, node_of_role, remove_live_nodes
 from .live_stream import NodeFrames
 
 
@@ -101,11 +101,24 @@ class LiveController:
         if self.case is None or self.case.folder != Path(folder).absolute() or self.live is None:
             case = Case.open(folder)
             case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now
-            self.close()
+            if self.live is not None:
+                self.close()
             self.case, self._overlays = case, OverlayMaker(case.vessels)
             self.live = LiveScene(self._scene, case)
             self.live.set_options(self.options)
         return self.case
+
+    def restore(self, case_path: Path, camera: Camera) -> bool:
+        """Show the frame that a saved scene brought, as `camera` took it, without overlay. False where there is none.
+
+        Raises InputError for a case that cannot be opened.
+        """
+        if node_of_role(self._scene, FRAME) is None:
+            return False
+        self.open_case(case_path)
+        self.live.take_replayed(camera)
+        self._set_visible(False, changed=True)
+        return True
 
     def start(self, choice: Choice, single: bool = False, model: OpenedModel | None = None) -> None:
         """Begin to register what was chosen. single: hold the first frame. Raises InputError with what is wrong."""

@@ -22,7 +22,7 @@ FIRST_PLANE_MM = 200.0  # where the frame is put up before any pose says how far
 PLANE_CHANGE = 0.1  # share by which the vessels' depth may leave the plane before the plane follows
 TRUE_RGB, PREDICTED_RGB = (0.16, 0.86, 0.24), (0.20, 0.43, 1.0)  # the paper's figure: true green, predicted blue
 FRAME, TRANSFORM, FRUSTUM = "frame", "transform", "frustum"
-OUTLINE, TRUTH, BOX, FILL, COLOURS = "outline", "truth", "box", "fill", "colours"
+OUTLINE, TRUTH, BOX, FILL, COLOURS, BACKDROP = "outline", "truth", "box", "fill", "colours", "backdrop"
 NAMES = {OUTLINE: "Predicted outline", TRUTH: "True outline", BOX: "Vessel box"}
 RGB = {OUTLINE: PREDICTED_RGB, TRUTH: TRUE_RGB, BOX: (1.0, 0.82, 0.2)}
 
@@ -46,7 +46,7 @@ class LiveScene:
 
     def __init__(self, scene, case: Case):
         self._scene, self._case = scene, case
-        remove_live_nodes(scene)
+        remove_live_nodes(scene, but=(FRAME, TRANSFORM))
         self.options = OverlayOptions()
         self.overlay_visible = False
         self.camera: Camera | None = None
@@ -62,11 +62,12 @@ class LiveScene:
         if self.transform is None:
             self.transform = _mark(scenes.add_camera_transform(scene, self.camera_to_ras), TRANSFORM)
         else:
-            scenes.set_pose(self.transform, self.camera_to_ras)
+            self.camera_to_ras = matrix_of(self.transform)
         self.frame = node_of_role(scene, FRAME)
         self.frustum = None
         self.lines = {role: self._add_lines(role) for role in NAMES}
         self.fill = self._add_fill()
+        self.backdrop = None
 
     def show(self, result: LiveResult) -> bool:
         """Put up a frame with its pose and overlay. True when the image plane moved or the frame changed its size.
@@ -76,6 +77,7 @@ class LiveScene:
         if result.image_rgb is None:
             self.set_overlay_visible(False)
             return False
+        self.follow_models()
         changed = self._set_geometry(result.camera, result.overlay)
         self._set_pixels(result.image_rgb, changed)
         if result.overlay is not None:
@@ -85,6 +87,19 @@ class LiveScene:
         self.show_truth(None, None)
         self._stamp = self._newest_change()
         return changed
+
+    @property
+    def camera_to_world(self) -> np.ndarray:
+        """Camera mm to what the views show: RAS, moved as the case's models are where they hang under a transform."""
+        return matrix_of(self.transform, to_world=True)
+
+    def follow_models(self) -> None:
+        """Hang camera and frame under the transform that the user put the vessels under, if any."""
+        parent = self.models[scenes.VESSELS].GetParentTransformNode()
+        if parent is not None and parent.GetAttribute(ROLE_ATTRIBUTE):
+            return  # the handles of the alignment: then the vessels move and the camera does not
+        if self.transform.GetParentTransformNode() is not parent:
+            self.transform.SetAndObserveTransformNodeID(parent.GetID() if parent is not None else None)
 
     @property
     def intact(self) -> bool:
@@ -157,9 +172,32 @@ class LiveScene:
         self.options = options
         self.set_overlay_visible(self.overlay_visible)
 
+    def show_backdrop(self, view_id: str) -> None:
+        """Hang the frame up behind the vessels, in one 3D view: that through the camera."""
+        if self.frame is None or self.camera is None:
+            return
+        if self.backdrop is None:
+            self.backdrop = _mark(self._scene.AddNewNodeByClass("vtkMRMLModelNode", "Microscope backdrop"), BACKDROP)
+            self.backdrop.CreateDefaultDisplayNodes()
+            self.backdrop.SetAndObserveTransformNodeID(self.transform.GetID())
+            for node in (self.backdrop, self.backdrop.GetDisplayNode()):
+                node.SetSaveWithScene(False)
+            self.backdrop.SetSelectable(False)
+            display = self.backdrop.GetDisplayNode()
+            display.SetLighting(False)
+            display.SetInterpolateTexture(True)
+            display.SetTextureImageDataConnection(self.frame.GetImageDataConnection())
+            display.AddViewNodeID(view_id)
+            self._backdrop_of = None
+        if self._backdrop_of != (self.camera, self.plane_mm):
+            self._backdrop_of = (self.camera, self.plane_mm)
+            behind_mm = self.plane_mm + 3 * self._case.vessels.radius_mm
+            self.backdrop.SetAndObservePolyData(_textured_frame(self.camera, behind_mm))
+        _set_visible(self.backdrop, self.overlay_visible)
+
     def close(self) -> None:
         """Take the live nodes out of the scene; those that a recording plays into stay, hidden overlay aside."""
-        remove_live_nodes(self._scene, keep_recorded=True)
+        remove_live_nodes(self._scene)
 
     def _set_geometry(self, camera: Camera, overlay: Overlay | None) -> bool:
         """Put the image plane where the vessels are; it follows only large changes, so that views keep their zoom."""
@@ -247,12 +285,14 @@ def is_recorded(scene, node) -> bool:
     return any(browsers.GetItemAsObject(i).IsProxyNode(node.GetID()) for i in range(browsers.GetNumberOfItems()))
 
 
-def remove_live_nodes(scene, keep_recorded: bool = True) -> None:
-    """Take every node with a role out of the scene, also those that a saved scene brought along."""
+def remove_live_nodes(scene, but: tuple[str, ...] = ()) -> None:
+    """Take the nodes with a role out of the scene, also those that a saved scene brought along.
+
+    Those that a recording plays into stay, and those of the roles in `but`.
+    """
     for node in _nodes(scene):
-        if not node.GetAttribute(ROLE_ATTRIBUTE) or not scene.IsNodePresent(node):
-            continue
-        if keep_recorded and is_recorded(scene, node):
+        role = node.GetAttribute(ROLE_ATTRIBUTE)
+        if not role or role in but or not scene.IsNodePresent(node) or is_recorded(scene, node):
             continue
         # Display nodes of a model would stay behind without it.
         displays = (
@@ -269,6 +309,18 @@ def remove_live_nodes(scene, keep_recorded: bool = True) -> None:
 def _nodes(scene) -> list:
     collection = scene.GetNodes()
     return [collection.GetItemAsObject(i) for i in range(collection.GetNumberOfItems())]
+
+
+def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
+    """4x4 of a linear transform node, to its parent or to the world."""
+    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+    matrix = vtkMatrix4x4()
+    if to_world:
+        transform_node.GetMatrixTransformToWorld(matrix)
+    else:
+        transform_node.GetMatrixTransformToParent(matrix)
+    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
 
 
 def _mark(node, role: str):
@@ -302,6 +354,29 @@ def _set_image(volume, image: np.ndarray) -> None:
     scalars.SetName("ImageScalars")
     data.GetPointData().SetScalars(scalars)
     volume.SetAndObserveImageData(data)
+
+
+def _textured_frame(camera: Camera, depth_mm: float):
+    """vtkPolyData: the frame's outer edges at that depth in camera mm, with texture coordinates."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    corners = np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
+    plane = scenes.camera_from_pixel(camera, depth_mm)
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(corners @ plane[:3, :3].T + plane[:3, 3], deep=True))
+    cells = vtkCellArray()
+    cells.InsertNextCell(4, range(4))
+    polydata = vtkPolyData()
+    polydata.SetPoints(points)
+    polydata.SetPolys(cells)
+    # Row 0 of the frame is the first row of the texture: v grows downwards, as in the frame.
+    coordinates = numpy_to_vtk(np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32), deep=True)
+    coordinates.SetName("TextureCoordinates")
+    polydata.GetPointData().SetTCoords(coordinates)
+    return polydata
 
 
 def _colour_table():

@@ -12,6 +12,7 @@ from . import scene as scenes
 from .live_scene import LiveScene
 
 MICROSCOPE, THROUGH, OVERVIEW, MRI = "Microscope", "MicroscopeCamera", "MicroscopeOverview", "MicroscopeMRI"
+DEPTH_VIEW_FRAMES = 2.5  # how many frames high the MRI's slice along the optical axis is shown
 FIRST_LAYOUT_ID = 617  # free ids are sought from here on; Slicer's own end below 100
 
 LAYOUT = f"""
@@ -49,8 +50,8 @@ LAYOUT = f"""
 
 
 class LiveViews:
-    """The views of the live layout. through_view: gives camera node and size (px) of the view through the camera, or
-    None while there is none; depth_node: the MRI's slice, or None."""
+    """The views of the live layout. through_view: gives view node, camera node and size (px) of the view through the
+    camera, or None while there is none; depth_node: the MRI's slice, or None."""
 
     def __init__(self, slice_node, composite_node, through_view: Callable[[], tuple | None], depth_node=None):
         self._slice, self._composite = slice_node, composite_node
@@ -60,7 +61,8 @@ class LiveViews:
     def follow(self, live: LiveScene, changed: bool) -> None:
         """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
         size = self._slice.GetDimensions()[:2]
-        align_slice(self._slice, live.camera, live.camera_to_ras, live.plane_mm)
+        camera_to_world = live.camera_to_world
+        align_slice(self._slice, live.camera, camera_to_world, live.plane_mm)
         if changed or self._fitted != (size, live.camera):
             self._fitted = (size, live.camera)
             fit_slice(self._slice, live.camera, live.plane_mm)
@@ -70,12 +72,15 @@ class LiveViews:
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
         if self._depth is not None and visible:
-            align_depth_slice(self._depth, live.camera_to_ras, live.plane_mm)
+            align_depth_slice(self._depth, camera_to_world, live.plane_mm)
+            if changed:
+                fit_slice(self._depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
         through = self._through_view()
         if through is not None:
-            camera_node, view_size_px = through
+            view_node, camera_node, view_size_px = through
+            live.show_backdrop(view_node.GetID())
             if visible:
-                aim_camera(camera_node, view_size_px, live.camera, live.camera_to_ras, live.plane_mm)
+                aim_camera(camera_node, view_size_px, live.camera, camera_to_world, live.plane_mm)
             else:
                 look_away(camera_node)
 

@@ -27,14 +27,14 @@ def install(say) -> bool:
     chosen = _ask()
     if chosen is None:
         return False
-    slicer.app.setOverrideCursor(qt.Qt.WaitCursor)
+    qt.QApplication.setOverrideCursor(qt.Qt.WaitCursor)
     try:
         return dependencies.install(KIND, chosen or None, lambda _packages: True, say)
     except ExpectedAppearancesError as error:
         say(str(error))
         return False
     finally:
-        slicer.app.restoreOverrideCursor()
+        qt.QApplication.restoreOverrideCursor()
 
 
 def _ask():

@@ -83,13 +83,14 @@ class LayoutSection:
         self._restrict_slice(widget.mrmlSliceNode(), manager)
 
     def _through(self) -> tuple | None:
-        """Camera node and size of the view through the camera."""
+        """View node, camera node and size of the view through the camera."""
         widget = self._three_d(live_views.THROUGH)
         if widget is None:
             return None
         node = widget.mrmlViewNode()
         camera_node = slicer.modules.cameras.logic().GetViewActiveCameraNode(node)
-        return None if camera_node is None else (camera_node, tuple(widget.threeDView().renderWindow().GetSize()))
+        size = tuple(widget.threeDView().renderWindow().GetSize())
+        return None if camera_node is None else (node, camera_node, size)
 
     def _restrict_slice(self, slice_node, manager) -> None:
         """Draw a slice in the overview only: in the view through the camera the frame would hide the vessels."""

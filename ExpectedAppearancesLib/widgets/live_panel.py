@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import qt
 import slicer
 from slicer.i18n import tr as _
 
 from ..errors import ExpectedAppearancesError
+from ..geometry.camera import Camera
 from ..live.trust import controls
 from ..mrml.live_controller import IDLE, LiveController
 from ..mrml.live_scene import OverlayOptions
@@ -17,9 +20,9 @@ from .live_record import RecordSection
 from .live_source import SourceSection
 from .live_status import StatusSection
 
-TICK_MS = 8
+TICK_MS = 4
 # Slicer holds Python's lock while it waits for events: only during this pause do the session's threads get it.
-WAIT_S = 0.004
+WAIT_S = 0.008
 IDLE_TICKS = 12  # while nothing runs, one tick in so many does work
 
 
@@ -34,6 +37,7 @@ class LivePanel:
         self._problem = ""
         self._missing = live_install.problem()
         self._ticks = 0
+        self._camera = None
         self.layout = LayoutSection()
         self.status = StatusSection(ui)
         self.source = SourceSection(ui, self.parameters, self.refresh)
@@ -54,7 +58,19 @@ class LivePanel:
 
     def enter(self) -> None:
         self.show_views()
+        self.restore()
         self._timer.start()
+
+    def restore(self) -> None:
+        """Put the views onto the frame that a loaded scene brought, without an overlay: nobody judges it yet."""
+        p = self._parameter_node
+        if p is None or self.controller.running or not p.cameraJson or not p.casePath:
+            return
+        try:
+            camera = Camera.from_dict(json.loads(p.cameraJson), "scene: camera of the last frame")
+            self.controller.restore(p.casePath, camera)
+        except (ExpectedAppearancesError, ValueError) as error:
+            self.say(str(error))
 
     def leave(self) -> None:
         """Another module is opened: the session goes on no further, since nobody would see whether to trust it."""
@@ -124,14 +140,14 @@ class LivePanel:
     def start(self, single: bool = False) -> bool:
         """Start what is chosen. False, and the reason in the panel, when it cannot be started."""
         self.say("")
-        slicer.app.setOverrideCursor(qt.Qt.WaitCursor)
+        qt.QApplication.setOverrideCursor(qt.Qt.WaitCursor)
         try:
             self.controller.start(self.source.choice(), single)
         except ExpectedAppearancesError as error:
             self.say(str(error))
             return False
         finally:
-            slicer.app.restoreOverrideCursor()
+            qt.QApplication.restoreOverrideCursor()
         self._parameter_node.browser = None
         self.refresh()
         self.tick()
@@ -141,6 +157,7 @@ class LivePanel:
         self.controller.stop()
         self.align.close()
         self.refresh()
+        self._ticks = -1  # say so now
         self.tick()
 
     def freeze(self, checked: bool) -> None:
@@ -175,6 +192,7 @@ class LivePanel:
             self.controller.alignment is not None,
             self.controller.recorder is not None,
         )
+        self._remember_camera()
         replayed = self.record.show(can.record and has_frame)
         self.align.show(can.align)
         status = replayed or status
@@ -196,6 +214,14 @@ class LivePanel:
         single = _("Next frame") if running and self.controller.frozen else _("Single frame")
         if ui.singleButton.text != single:
             ui.singleButton.text = single
+
+    def _remember_camera(self) -> None:
+        """A of the frame on the screen, in the parameter node: a scene does not save a view's window centre."""
+        camera, p = self.controller.camera, self._parameter_node
+        if camera is None or camera == self._camera or p is None:
+            return
+        self._camera = camera
+        p.cameraJson = json.dumps(camera.to_dict())
 
     def _show_problem(self) -> None:
         text = self._message or ("" if self.controller.running else self._problem)

@@ -32,7 +32,7 @@ def make_sample(where: Path) -> tuple[Path, Path]:
 def run_sample(panel: LivePanel) -> bool:
     """Make the sample and start the panel on it. False, and the reason in the panel, when it cannot be started."""
     parameters = panel.parameters()
-    slicer.app.setOverrideCursor(qt.Qt.WaitCursor)
+    qt.QApplication.setOverrideCursor(qt.Qt.WaitCursor)
     try:
         slicer.util.showStatusMessage(_("Generating the phantom ..."))
         case, frames = make_sample(folder())
@@ -41,7 +41,7 @@ def run_sample(panel: LivePanel) -> bool:
         return False
     finally:
         slicer.util.showStatusMessage("")
-        slicer.app.restoreOverrideCursor()
+        qt.QApplication.restoreOverrideCursor()
     panel.stop()
     parameters.casePath, parameters.sourcePath = str(case), str(frames)
     parameters.sourceKind = SourceKind.PATH.value

@@ -163,7 +163,7 @@ def started(folder: Path):
     widget = opened()
     p = widget.panel.parameters()
     p.casePath, p.sourcePath, p.sourceKind = str(folder / "case"), str(folder / "frames"), "path"
-    p.repeat, p.rateHz, p.staleMs = True, 15.0, 2000
+    p.repeat, p.rateHz, p.staleMs = True, 15.0, 20000
     pump(0.1)
     widget.ui.startButton.enabled = True
     widget.ui.startButton.click()

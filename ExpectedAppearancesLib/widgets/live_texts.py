@@ -39,6 +39,8 @@ def headline(status: Status) -> str:
 def detail(status: Status) -> str:
     """What to do about it, or what it means; one or two lines."""
     verdict = status.verdict
+    if verdict.sight is Sight.FAILED:
+        return _("{error}. Stop and start again; if it returns, send Slicer's log.").format(error=verdict.detail)
     if verdict.detail:
         return verdict.detail
     texts = {

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import qt
 from slicer.i18n import tr as _
 
 from ..case.steps import StepState
-from .planning_devices import device_arguments
+from ..gpus import device_arguments
+from ..textures.library import LABELS_SUFFIX
 from .planning_run import RunControls, started
 from .planning_section import Section
 
 NEWEST_PX = 220
+CONTACT_SHEET = "contact_sheet.png"  # lies beside them
 
 
 class AppearancesSection(Section):
@@ -75,28 +78,29 @@ class AppearancesSection(Section):
         return [*options, "--size", str(p.sizePx), "--iterations", str(p.iterations), *device], environment
 
     def _show_newest(self, p) -> None:
-        """The image that was finished last, from the index: it lists whole files only."""
-        case, index = self.session.case(p), self.panel.recorded.index
-        items = index["items"] if case and index else []
-        if not items:
-            self.ui.newestImage.visible = False
-            self._shown = None
+        """The image that was finished last; files appear whole."""
+        case = self.session.case(p)
+        path, count = newest_image(case.appearances_folder / p.method.value) if case else (None, 0)
+        self.ui.newestImage.visible = path is not None
+        if path is None or (path, count) == self._shown:
             return
-        path = Path(case.appearances_folder) / p.method.value / items[-1]["image"]
-        try:
-            version = (str(path), path.stat().st_mtime_ns)
-        except OSError:
-            return
-        if version == self._shown:
-            return
-        self._shown = version
-        picture = qt.QPixmap(str(path))
+        self._shown = (path, count)
+        picture = qt.QPixmap(path)
         if picture.isNull():
             return
         self.ui.newestImage.setPixmap(
             picture.scaled(NEWEST_PX, NEWEST_PX, qt.Qt.KeepAspectRatio, qt.Qt.SmoothTransformation)
         )
-        self.ui.newestImage.toolTip = _("Texture {style}, the newest of {count}").format(
-            style=items[-1]["style"], count=len(items)
-        )
-        self.ui.newestImage.visible = True
+        self.ui.newestImage.toolTip = _("{name}, the newest of {count}").format(name=Path(path).name, count=count)
+
+
+def newest_image(folder: Path) -> tuple[str | None, int]:
+    """Path of the appearance that was written last, and how many there are."""
+    try:
+        with os.scandir(folder) as entries:
+            images = [entry for entry in entries if entry.name.endswith(".png") and entry.name[0] != "."]
+            images = [e for e in images if not e.name.endswith(LABELS_SUFFIX) and e.name != CONTACT_SHEET]
+            newest = max(images, key=lambda entry: entry.stat().st_mtime_ns, default=None)
+            return (newest.path if newest else None), len(images)
+    except OSError:
+        return None, 0

@@ -19,6 +19,7 @@ from .planning_section import NodeWatch, Section, changed
 
 # Of models, segmentations and the transforms above them.
 NODE_EVENTS = ("ModifiedEvent", slicer.vtkMRMLTransformableNode.TransformModifiedEvent)
+OWN_TEXTURES = "textures"  # photographs added to this case
 SAVE_HINT = "Check models and microscope, and write them into the case folder."
 
 
@@ -154,8 +155,10 @@ class CaseSection(Section):
             self._tell(error.problems)
             return
         # Made beside the old case and put in its place when it is whole.
-        made = folder.with_name(f".{folder.name}.new") if folder.is_dir() and any(folder.iterdir()) else folder
-        shutil.rmtree(made, ignore_errors=True) if made != folder else None
+        made = folder
+        if (folder / MANIFEST_NAME).is_file():
+            made = folder.with_name(f".{folder.name}.new")
+            shutil.rmtree(made, ignore_errors=True)
         command, environment = library_command("ExpectedAppearancesLib", "new", str(made), *options)
 
         def done(code: int, output: str) -> None:
@@ -177,8 +180,11 @@ class CaseSection(Section):
     def _put_in_place(self, made: Path, folder: Path) -> None:
         try:
             if made != folder:
-                folder.rename(_kept_name(folder))
+                kept = _kept_name(folder)
+                folder.rename(kept)
                 made.rename(folder)
+                if (kept / OWN_TEXTURES).is_dir():
+                    shutil.copytree(kept / OWN_TEXTURES, folder / OWN_TEXTURES)
         except OSError as error:
             self._tell(
                 [

@@ -1,52 +1,17 @@
-"""Which graphics cards a run could use, found without loading torch into Slicer."""
+"""Asks the driver which graphics cards there are, without waiting for the answer."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 
+from ..gpus import PROGRAM, QUERY, Gpu, parse_gpus
 from .planning_qt import Child
-
-QUERY = ["--query-gpu=index,name,memory.total", "--format=csv,noheader,nounits"]
-
-
-@dataclass(frozen=True)
-class Gpu:
-    """index: as the driver counts. memory_gb: all of it, used or not."""
-
-    index: int
-    name: str
-    memory_gb: float
-
-    @property
-    def key(self) -> str:
-        """What the panel keeps in the scene."""
-        return f"cuda:{self.index}"
 
 
 def find_gpus(on_found: Callable[[list[Gpu]], None]) -> Child | None:
-    """Ask the driver; `on_found` is called once, from the event loop. None, and no call, where there is no driver."""
-    program = shutil.which("nvidia-smi")
+    """`on_found` is called once, from the event loop. None, and no call, where there is no driver."""
+    program = shutil.which(PROGRAM)
     if program is None:
         return None
     return Child([program, *QUERY], lambda code, output: on_found(parse_gpus(output) if code == 0 else []))
-
-
-def parse_gpus(output: str) -> list[Gpu]:
-    """From lines such as "0, NVIDIA RTX A4000, 16376" (MiB); other lines are left out."""
-    gpus = []
-    for line in output.splitlines():
-        parts = [part.strip() for part in line.split(",")]
-        if len(parts) >= 3 and parts[0].isdigit() and parts[-1].replace(".", "", 1).isdigit():
-            gpus.append(Gpu(int(parts[0]), ", ".join(parts[1:-1]), float(parts[-1]) / 1024))
-    return gpus
-
-
-def device_arguments(device: str) -> tuple[list[str], dict[str, str]]:
-    """Options and environment of a run for 'auto', 'cpu' or 'cuda:N'. A run sees only the card that it shall use."""
-    kind, _, index = device.partition(":")
-    if kind == "cuda" and index:
-        # By the bus, as nvidia-smi counts; CUDA's own order puts the fastest first.
-        return ["--device", "cuda"], {"CUDA_DEVICE_ORDER": "PCI_BUS_ID", "CUDA_VISIBLE_DEVICES": index}
-    return ["--device", kind], {}

@@ -9,7 +9,8 @@ import slicer
 from slicer.i18n import tr as _
 
 from ..runs import dependencies
-from .planning_qt import Child, allow, library_command
+from ..runs.system_report import SystemCheck, system_report
+from .planning_qt import allow
 
 KINDS = ("planning", "training")
 
@@ -19,7 +20,10 @@ class HelpSection:
 
     def __init__(self, panel):
         self.panel, self.ui = panel, panel.ui
-        self._checking: Child | None = None
+        self._checking: SystemCheck | None = None
+        self._timer = qt.QTimer()
+        self._timer.setInterval(200)
+        self._timer.connect("timeout()", self._look)
         self._missing: list[str] | None = None
         self.ui.installButton.connect("clicked(bool)", lambda _checked=False: self.on_install())
         self.ui.installFolderButton.connect("clicked(bool)", lambda _checked=False: self.on_install_from_folder())
@@ -40,9 +44,8 @@ class HelpSection:
         allow(self.ui.systemCheckButton, busy, _("Versions, graphics cards, memory and disk, to copy into a mail."))
 
     def close(self) -> None:
-        if self._checking:
-            self._checking.stop()
-            self._checking = None
+        self._timer.stop()
+        self._checking = None
 
     def on_install(self, wheels_folder: Path | None = None) -> None:
         def confirm(names: list[str]) -> bool:
@@ -63,14 +66,16 @@ class HelpSection:
 
     def on_check(self) -> None:
         """In a process of its own: it loads torch."""
-        command, environment = library_command("ExpectedAppearancesLib", "check")
+        self._checking = SystemCheck()
+        self._timer.start()
+        self.panel.refresh_soon()
 
-        def done(_code: int, output: str) -> None:
-            self._checking = None
-            self.show_text(output)
-            self.panel.refresh_soon()
-
-        self._checking = Child(command, done, environment)
+    def _look(self) -> None:
+        report = self._checking.poll() if self._checking else None
+        if report is None:
+            return
+        self.close()
+        self.show_text(system_report(report) if report else _("The check could not be run; look into Slicer's log."))
         self.panel.refresh_soon()
 
     def show_text(self, text: str) -> None:

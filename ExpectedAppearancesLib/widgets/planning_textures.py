@@ -15,6 +15,7 @@ from .. import files
 from ..errors import InputError
 from ..masks.labels import VESSELS
 from ..textures.library import LABELS_SUFFIX, list_textures, read_texture, shipped_textures_folder
+from .planning_case import OWN_TEXTURES
 from .planning_labelling import Labelling
 from .planning_qt import Stepper, allow, quiet
 from .planning_section import Section, changed
@@ -159,7 +160,7 @@ class TexturesSection(Section):
                 _("Choose a folder for your textures first, or save the case: then they go there.")
             )
             return False
-        folder = case.folder / "textures"
+        folder = case.folder / OWN_TEXTURES
         if not folder.is_dir():
             shutil.copytree(shipped_textures_folder(), folder)
         changed(p, "texturesPath", str(folder))

@@ -8,10 +8,11 @@ import slicer
 from slicer.i18n import tr as _
 
 from ..case.steps import StepState
+from ..gpus import Gpu, device_arguments
 from ..model.presets import PRESETS
 from ..mrml import charts
 from ..runs.state import RunStatus
-from .planning_devices import Gpu, device_arguments, find_gpus
+from .planning_devices import find_gpus
 from .planning_qt import allow, quiet
 from .planning_run import RunControls, started
 from .planning_section import Section, changed
@@ -61,13 +62,11 @@ class TrainingSection(Section):
         if self.panel.runs["synthesize"].active:
             problem = _("Expected appearances are being made; wait until they are ready.")
         self.controls.refresh(problem, unfinished=self._unfinished())
-        case = self.session.case(p)
-        curve = self._curve(case)
+        curve = self._curve(self.session.case(p))
         allow(
             ui.showLossButton, "" if curve else _("Nothing has been trained yet."), _("Show the plot of loss and ADD.")
         )
-        if curve and (self.panel.runs["train"].active or charts.chart_of(self.panel.scene, "training.chart")):
-            self._plot(curve)
+        self._plot(curve)
 
     def close(self) -> None:
         self._live, self._plotted = [], None
@@ -80,6 +79,8 @@ class TrainingSection(Section):
         if not self._live or self._live[-1]["step"] != step:
             loss, add = (status.values.get(key) for key in ("loss", "validation_add_mm"))
             self._live.append({"step": step, "loss": loss, "validation_add_mm": add})
+        if self.parameters is not None:  # the plot is looked at while another module is used
+            self._plot(self._curve(self.session.case(self.parameters)))
 
     def on_start(self) -> None:
         self._live = []
@@ -114,8 +115,9 @@ class TrainingSection(Section):
         slicer.modules.plots.logic().ShowChartInLayout(chart)
 
     def _plot(self, curve: list[dict]) -> None:
-        version = (len(curve), curve[-1]["step"])
-        if version != self._plotted:
+        """Bring the plot up to date where there is one; it comes with the start, or when it is asked for."""
+        version = (len(curve), curve[-1]["step"]) if curve else None
+        if curve and version != self._plotted and charts.chart_of(self.panel.scene, "training.chart"):
             self._plotted = version
             charts.show_training(self.panel.scene, curve)
 

@@ -3,67 +3,77 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-
-from ExpectedAppearancesLib.case.meshes import Mesh, read_mesh
-from ExpectedAppearancesLib.demo.vessel_tree import demo_camera, generate_case_meshes
-from ExpectedAppearancesLib.geometry.camera import Camera, read_camera
-from ExpectedAppearancesLib.masks.renderer import MaskRenderer
-from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
-from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
-
-MAPS = 40
-ROUNDS = 3
+# Modules of this folder with measure(inputs_folder) -> dict of keys of benchmark.json; one that is not there is left
+# out. Each runs in a process of its own: VTK and torch's threads do not meet, and memory is its own.
+STAGES = ("masks", "synthesis", "synthesis_scaling", "surface_views", "training", "registration", "live_update")
+HERE = Path(__file__).parent
+LIMIT_S = 600
 
 
-def measure_masks(vessels: Mesh, cortex: Mesh, camera: Camera) -> dict:
-    """Label maps per second with one window kept, against a window made for every map; rounds alternate."""
-    sampler = PoseSampler(find_craniotomy(vessels, cortex), PoseRanges(), camera, vessels.vertices_mm)
-    poses = [sampler.sample(i) for i in range(MAPS)]
-    kept, fresh = [], []
-    for _ in range(ROUNDS):
-        with MaskRenderer(vessels, cortex, camera) as renderer:
-            renderer.render(poses[0])
-            begin = time.perf_counter()
-            for pose in poses:
-                renderer.render(pose)
-            kept.append(MAPS / (time.perf_counter() - begin))
-        begin = time.perf_counter()
-        for pose in poses[: MAPS // 4]:
-            with MaskRenderer(vessels, cortex, camera) as renderer:
-                renderer.render(pose)
-        fresh.append(MAPS // 4 / (time.perf_counter() - begin))
-    ratios = np.array(kept) / np.array(fresh)
-    return {
-        "maps_per_s": round(float(np.median(kept)), 1),
-        "reference_maps_per_s": round(float(np.median(fresh)), 1),
-        "ratio": round(float(np.median(ratios)), 2),
-        "size_px": [camera.width, camera.height],
-    }
-
-
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--inputs", type=Path, metavar="DIR", help="vessels.vtp, cortex.vtp, camera.json; else generated"
+        "--inputs", type=Path, metavar="DIR", help="vessels.vtp, cortex.vtp, camera.json, textures/; else generated"
     )
     parser.add_argument("--out", type=Path, default=Path("build/benchmark.json"))
+    parser.add_argument("--only", nargs="+", choices=STAGES, default=STAGES, metavar="STAGE", help="not all stages")
+    parser.add_argument("--measure", choices=STAGES, help=argparse.SUPPRESS)  # in the stage's own process
     args = parser.parse_args()
-    if args.inputs:
-        vessels, cortex = (read_mesh(args.inputs / f"{name}.vtp", f"{name} mesh") for name in ("vessels", "cortex"))
-        camera = read_camera(args.inputs / "camera.json")
-    else:
-        vessels, cortex = generate_case_meshes(0)
-        camera = demo_camera()
-    result = {"masks": measure_masks(vessels, cortex, camera)}
+    if args.measure:
+        result = importlib.import_module(args.measure).measure(args.inputs)
+        args.out.write_text(json.dumps(result), encoding="utf-8")
+        return 0
+    failed = []
+    result: dict = {}
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = args.inputs or _generated(Path(folder) / "inputs")
+        for stage in args.only:
+            if not (HERE / f"{stage}.py").is_file():
+                continue
+            begin, part = time.monotonic(), Path(folder) / f"{stage}.json"
+            command = [sys.executable, __file__, "--measure", stage, "--inputs", str(inputs), "--out", str(part)]
+            try:
+                ended = subprocess.run(command, timeout=LIMIT_S).returncode
+            except subprocess.TimeoutExpired:
+                ended = f"more than {LIMIT_S} s"
+            if ended == 0:
+                _merge(result, json.loads(part.read_text(encoding="utf-8")))
+            else:
+                failed.append(stage)
+            print(f"{stage}: {time.monotonic() - begin:.0f} s" + (f", FAILED ({ended})" if ended else ""), flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(result, indent=1))
+    return 1 if failed else 0
+
+
+def _merge(into: dict, found: dict) -> None:
+    for key, value in found.items():
+        if isinstance(value, dict) and isinstance(into.get(key), dict):
+            into[key].update(value)
+        else:
+            into[key] = value
+
+
+def _generated(folder: Path) -> Path:
+    from ExpectedAppearancesLib.case.meshes import write_vtp
+    from ExpectedAppearancesLib.demo.vessel_tree import demo_camera, generate_case_meshes
+    from ExpectedAppearancesLib.geometry.camera import write_camera
+
+    folder.mkdir(parents=True)
+    for name, mesh in zip(("vessels", "cortex"), generate_case_meshes(0), strict=True):
+        write_vtp(folder / f"{name}.vtp", mesh)
+    write_camera(folder / "camera.json", demo_camera())
+    return folder
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
