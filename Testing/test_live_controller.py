@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 import numpy as np
@@ -201,6 +202,28 @@ def test_garbage_is_said_and_recovered_from(application, phantom, model, frames,
     status = wait_for(controller, lambda s: s.new)
     assert status.verdict.sight is Sight.FOLLOWING
     np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][4])
+    controller.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="sleeps in libc with Python's lock held")
+def test_frames_are_registered_although_the_gui_holds_pythons_lock_between_ticks(application, phantom, model, frames):
+    import ctypes
+
+    from ExpectedAppearancesLib.live.frames import LiveFrame
+
+    scene, _logic = application
+    node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    holding = ctypes.PyDLL(None)  # unlike CDLL, it keeps the lock, as Slicer's event loop does
+    shown = 0
+    for number in range(400):
+        controller._session.push(LiveFrame(frames[1][number % 12], time.monotonic(), number))
+        shown += controller.tick(0.008).new
+        holding.usleep(4000)
+        if shown == 5:
+            break
+    assert shown == 5
     controller.close()
 
 

@@ -575,6 +575,8 @@ def test_notes_come_back_exactly_and_foreign_ones_are_refused():
     assert key == "abc" and again.name == "ä 7" and again.time_s == 1.25
     np.testing.assert_array_equal(again.prediction.camera_from_world, POSE)
     assert again.prediction.confidence == 0.123456789 and again.prediction.accepted
+    unknown = recording.RecordedFrame(0.0, "b", CAMERA, Prediction(POSE, True, float("nan"), 0.0))
+    assert np.isnan(recording.from_note(recording.to_note(unknown, "abc"))[0].prediction.confidence)
     for text in ("", "{}", '{"format": "x"}', recording.to_note(frame, "abc").replace("true", '"yes"')):
         if "yes" in text:
             assert not recording.from_note(text)[0].prediction.accepted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -82,8 +83,8 @@ def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path,
         frame.image: Prediction(
             frame.camera_from_world,
             frame.accepted,
-            float(frame.extra.get("confidence", 1.0 if frame.accepted else 0.0)),
-            float(frame.extra.get("latency_ms", 0.0)),
+            _number(frame.extra.get("confidence"), math.nan),
+            _number(frame.extra.get("latency_ms"), 0.0),
         )
         for frame in frames
     }
@@ -93,3 +94,7 @@ def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path,
             f"{poses_path}: none of its images exists, {missing[0]} for one; restore them beside the file."
         )
     return camera, [frame.image for frame in frames if frame.image.is_file()], given
+
+
+def _number(value, otherwise: float) -> float:
+    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else otherwise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,7 @@ def to_note(frame: RecordedFrame, case_key: str) -> str:
             "camera": frame.camera.to_dict(),
             "camera_from_world": None if pose is None else np.asarray(pose, float).tolist(),
             "accepted": bool(prediction.accepted),
-            "confidence": float(prediction.confidence),
+            "confidence": _known(prediction.confidence),
             "latency_ms": float(prediction.latency_ms),
         }
     )
@@ -68,7 +69,7 @@ def from_note(text: str) -> tuple[RecordedFrame, str]:
         prediction = Prediction(
             pose,
             values["accepted"] is True and pose is not None,
-            float(values["confidence"]),
+            math.nan if values["confidence"] is None else float(values["confidence"]),
             float(values["latency_ms"]),
         )
         camera = Camera.from_dict(values["camera"], "recorded frame: camera")
@@ -98,11 +99,16 @@ def export_recording(folder: Path, frames: Iterable[RecordedFrame]) -> Path:
         image = folder / "frames" / f"{number:05d}.png"
         files.write_png(image, frame.image_rgb)
         entry = frame_record(image, frame.prediction) | {"time_s": round(frame.time_s, 4), "source": frame.name}
-        entries.append(entry | {"confidence": frame.prediction.confidence})
+        entries.append(entry | {"confidence": _known(frame.prediction.confidence)})
     if not entries:
         raise InputError("recording: there is no frame to export; record some first.")
     write_poses(folder / "poses.json", camera, entries)
     return folder / "poses.json"
+
+
+def _known(confidence: float) -> float | None:
+    """JSON has no NaN: a pose whose confidence nobody gave."""
+    return float(confidence) if math.isfinite(confidence) else None
 
 
 def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray) -> Path:

@@ -322,10 +322,9 @@ class _Trainer:
         chosen = np.flatnonzero(found & (probability >= least))
         centre = self.encoding.centre_world_mm
         errors = [pose_error(batch.camera_from_world[i], readings[i].camera_from_world, centre) for i in chosen]
-        fits = None
-        if self.preset.estimator == "dense":
-            fits = np.array([correlated(readings[i].fit, centre) for i in chosen])
-        return calibrate_covariance(np.array(errors), fits)
+        none = np.zeros((6, 6))
+        fits = [none if readings[i].fit is None else correlated(readings[i].fit, centre) for i in chosen]
+        return calibrate_covariance(np.array(errors).reshape(-1, 6), np.array(fits).reshape(-1, 6, 6))
 
     def _save(self) -> None:
         checkpoint.save(self.folder, self.network, self.average, self.best, self.optimizer, self.state)

@@ -47,8 +47,9 @@ class Status:
 
     @property
     def confidence(self) -> float | None:
+        """Of the pose on the screen; None where there is none, or where its file did not say."""
         known = self.result is not None and self.result.prediction is not None
-        return self.result.prediction.confidence if known else None
+        return self.result.prediction.confidence if known and np.isfinite(self.result.prediction.confidence) else None
 
     @property
     def latency_ms(self) -> float | None:
@@ -75,6 +76,7 @@ class LiveController:
         self._session: LiveSession | None = None
         self._stream: NodeFrames | None = None
         self._model: OpenedModel | None = None
+        self._registers = True
         self._overlays: OverlayMaker | None = None
         self._replayed: tuple | None = None
 
@@ -128,6 +130,7 @@ class LiveController:
         case = self.open_case(choice.case_path)
         if choice.needs_model:
             self._model = model or open_model(case)
+        self._registers = choice.needs_model
         estimator = self._model.estimator if choice.needs_model else None
         self._session = LiveSession(case, estimator, opened.camera, choice.frames, choice.stale_s, self._clock)
         self._session.start(opened.source, single or opened.still)
@@ -345,7 +348,7 @@ class LiveController:
         return node
 
     def _status(self, update: Update) -> Status:
-        device = self._model.device if self._model else ""
+        device = self._model.device if self._model and self._registers else ""
         return Status(update.verdict, update.shown, update.dropped, device, update.new is not None)
 
     def _was_visible(self) -> bool:

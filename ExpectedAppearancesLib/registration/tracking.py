@@ -55,7 +55,7 @@ class TrackerSettings:
     lost_sigma_mm: float = 10.0
     lost_sigma_deg: float = 12.0
     agreeing_frames: int = 3
-    lasting_share: float = 0.5
+    lasting_share: float = 0.6
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,14 @@ class StatusSection:
         self._set(ui.latencyLabel, "–" if latency_ms is None else f"{latency_ms:.0f} ms")
         self._set(ui.ageLabel, live_texts.age(status.verdict.age_s))
         self._set(ui.droppedLabel, str(status.dropped))
-        self._set(ui.modelLabel, _("The model runs on: {device}").format(device=status.device) if status.device else "")
+        self._set(ui.modelLabel, self._origin(status))
+
+    @staticmethod
+    def _origin(status: Status) -> str:
+        """Where the poses come from."""
+        if status.device:
+            return _("The model runs on: {device}").format(device=status.device)
+        return _("The poses were made before; no model runs.") if status.result is not None else ""
 
     @staticmethod
     def _set(label, text: str) -> None:

@@ -43,6 +43,8 @@ def detail(status: Status) -> str:
         return _("{error}. Stop and start again; if it returns, send Slicer's log.").format(error=verdict.detail)
     if verdict.detail:
         return verdict.detail
+    if verdict.sight is Sight.FROZEN and status.result is not None and status.result.image_rgb is None:
+        return _("A recorded frame, with the pose that it had.")
     texts = {
         Sight.IDLE: _("Choose a case and a source, then press Start."),
         Sight.WAITING: _("Started; no frame has come yet."),

@@ -48,6 +48,7 @@ class AppearancesSection(Section):
             before = self.panel.steps[name]
             if before.state in (StepState.STALE, StepState.MISSING):
                 problem = problem or before.text
+        problem = problem or self.panel.help.reason("training")
         if self.panel.runs["train"].active:
             problem = _("The model is being trained; cancel that first.")
         index = self.panel.recorded.index

@@ -19,6 +19,7 @@ from .planning_section import NodeWatch, Section, changed
 
 # Of models, segmentations and the transforms above them.
 NODE_EVENTS = ("ModifiedEvent", slicer.vtkMRMLTransformableNode.TransformModifiedEvent)
+EXPORTED = {"vessels.vtk": "Vessel model", "cortex.vtk": "Cortex model", "camera.json": "Microscope"}
 OWN_TEXTURES = "textures"  # photographs added to this case
 SAVE_HINT = "Check models and microscope, and write them into the case folder."
 
@@ -164,6 +165,8 @@ class CaseSection(Section):
         def done(code: int, output: str) -> None:
             self._saving = None
             shutil.rmtree(exported, ignore_errors=True)
+            for name, title in EXPORTED.items():  # the user knows the nodes, not the files in between
+                output = output.replace(str(exported / name), _(title))
             if code:
                 self._tell(problems_in(output))
             else:

@@ -24,7 +24,7 @@ class HelpSection:
         self._timer = qt.QTimer()
         self._timer.setInterval(200)
         self._timer.connect("timeout()", self._look)
-        self._missing: list[str] | None = None
+        self._missing: dict[str, list[str]] | None = None
         self.ui.installButton.connect("clicked(bool)", lambda _checked=False: self.on_install())
         self.ui.installFolderButton.connect("clicked(bool)", lambda _checked=False: self.on_install_from_folder())
         self.ui.systemCheckButton.connect("clicked(bool)", lambda _checked=False: self.on_check())
@@ -33,15 +33,29 @@ class HelpSection:
         self._missing = None
 
     def refresh(self) -> None:
-        if self._missing is None:
-            self._missing = sorted({name for kind in KINDS for name in dependencies.missing(kind)})
-        text = _("Missing Python packages: {names}.").format(names=", ".join(self._missing))
-        self.ui.missingLabel.text = text if self._missing else _("All Python packages are there.")
-        reason = "" if self._missing else _("Nothing is missing.")
+        names = sorted({name for kind in KINDS for name in self.missing(kind)})
+        text = _("Missing Python packages: {names}.").format(names=", ".join(names))
+        self.ui.missingLabel.text = text if names else _("All Python packages are there.")
+        reason = "" if names else _("Nothing is missing.")
         allow(self.ui.installButton, reason, _("Download and install them; you are asked first."))
         allow(self.ui.installFolderButton, reason, _("Install them from a folder of wheels, without a network."))
         busy = _("The system is being checked.") if self._checking else ""
         allow(self.ui.systemCheckButton, busy, _("Versions, graphics cards, memory and disk, to copy into a mail."))
+
+    def missing(self, kind: str) -> list[str]:
+        """What has to be installed for "planning" or "training"; looked up once each time the module is entered."""
+        if self._missing is None:
+            self._missing = {kind: dependencies.missing(kind) for kind in KINDS}
+        return self._missing[kind]
+
+    def reason(self, kind: str) -> str:
+        """Why nothing of this kind can be started; '' where all packages are there."""
+        names = ", ".join(name.partition(">=")[0] for name in self.missing(kind))
+        return (
+            _("Python packages are missing: {names}. Install them in Settings and help.").format(names=names)
+            if names
+            else ""
+        )
 
     def close(self) -> None:
         self._timer.stop()

@@ -56,8 +56,8 @@ class PlanningPanel:
         self._ending_timer.setInterval(500)
         self._ending_timer.connect("timeout()", self._poll_ending)
         self.runs = {kind: RunWatch(kind, lambda status, k=kind: self._on_run(k, status)) for kind in SECTION_OF_KIND}
-        self.sections = {section.name: section(self) for section in SECTIONS}
         self.help = HelpSection(self)
+        self.sections = {section.name: section(self) for section in SECTIONS}
 
     def set_parameters(self, parameters, connect: Callable[[], None]) -> None:
         """Show these parameters, or none; `connect` binds them to the widgets, which must not answer meanwhile."""
@@ -136,6 +136,8 @@ class PlanningPanel:
                 with slicer.util.tryWithErrorDisplay(_("The case could not be opened."), waitCursor=True):
                     if adopt(self.session, self.parameters, self.scene) is None:
                         slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
+                    elif slicer.app.layoutManager():
+                        slicer.util.resetThreeDViews()
             finally:
                 self.loading = False
         self.refresh()

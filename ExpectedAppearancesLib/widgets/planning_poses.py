@@ -59,11 +59,14 @@ class PosesSection(Section):
         allow(ui.lateralSlider, reason, _("Largest distance of the point looked at from the craniotomy's centre."))
         with quiet(ui.poseSlider):
             ui.poseSlider.maximum = max(p.poseCount - 1, 0)
+        changed(p, "poseIndex", min(p.poseIndex, p.poseCount - 1))
         try:
             sampler = self.session.sampler(p)
             problem = ""
         except InputError as error:
             sampler, problem = None, str(error)
+        if sampler is not None and self.panel.help.reason("planning"):
+            sampler, problem = None, self.panel.help.reason("planning")
         self._show_automatic(p, sampler)
         allow(ui.showCamerasCheck, problem, _("Draw the sampled cameras in the 3D view."))
         allow(ui.lookThroughCheck, problem, _("Show in the Red slice view what the camera would see."))
@@ -130,7 +133,8 @@ class PosesSection(Section):
         if p is None:
             return
         try:
-            sampler = self.session.sampler(p) if p.lookThrough and self.panel.entered else None
+            wanted = p.lookThrough and self.panel.entered and not self.panel.help.reason("planning")
+            sampler = self.session.sampler(p) if wanted else None
             vessels, cortex = (self.session.mesh(p, name) for name in ("vessels", "cortex"))
         except InputError:
             sampler = None

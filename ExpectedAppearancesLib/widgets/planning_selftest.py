@@ -24,7 +24,7 @@ from ..runs import dependencies
 from ..textures.library import LABELS_SUFFIX, read_library, shipped_textures_folder
 
 HEAVY = {"torch", "cv2", "onnxruntime", "skimage"}
-LONGEST_WAIT_S = 600.0
+LONGEST_WAIT_S = 1200.0  # on a busy computer; usually a minute or two
 
 
 def test_opening_loads_nothing_heavy(test) -> None:
@@ -397,7 +397,7 @@ def _events(seconds: float) -> None:
         time.sleep(0.005)
 
 
-def _wait(test, condition, seconds: float = 30.0) -> None:
+def _wait(test, condition, seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         test.assertLess(time.monotonic(), end, "waited too long")

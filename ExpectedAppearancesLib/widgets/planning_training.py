@@ -59,6 +59,7 @@ class TrainingSection(Section):
         before = self.panel.steps["appearances"]
         if before.state is not StepState.DONE:
             problem = problem or before.text
+        problem = problem or self.panel.help.reason("training")
         if self.panel.runs["synthesize"].active:
             problem = _("Expected appearances are being made; wait until they are ready.")
         self.controls.refresh(problem, unfinished=self._unfinished())
