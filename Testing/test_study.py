@@ -28,6 +28,7 @@ from ExpectedAppearancesLib.evaluation.verdict import figures_of_study
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
 from ExpectedAppearancesLib.registration.predictor import Prediction
+from ExpectedAppearancesLib.runs.environment import library_environment
 
 SHIFT_MM = {"a": 1.0, "b": 2.0, "c": 4.0}
 QUICK = study.StudySettings(protocols=("strict",), steps=5)
@@ -205,7 +206,7 @@ def test_a_study_that_is_killed_goes_on(studied, tmp_path):
         f"settings = study.StudySettings(protocols=('strict',), steps=5)\n"
         f"study.run_study([({str(studied.case)!r}, {str(studied.poses)!r})], Path({str(studied.out)!r}), settings)\n"
     )
-    process = subprocess.Popen([sys.executable, str(driver)])
+    process = subprocess.Popen([sys.executable, str(driver)], env=library_environment())
     wait_until(lambda: len(calls(studied)) == 2)
     child = int((studied.trainer / "pid").read_text())
     process.send_signal(getattr(signal, "SIGKILL", signal.SIGTERM))

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from .. import files
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, CancelledError, ExpectedAppearancesError, InputError
+from ..runs.environment import library_environment
 
 PROTOCOLS = ("strict", "loto")
 COMMAND = (sys.executable, "-m", "ExpectedAppearancesLib")
@@ -87,8 +88,9 @@ def train_fold(
         [*COMMAND, *job.arguments()],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        text=True,
+        encoding="utf-8",
         errors="replace",
+        env=library_environment(),
     )
     said: list[str] = []
     reader = threading.Thread(target=_read_lines, args=(process.stderr, said), daemon=True)

@@ -56,7 +56,7 @@ def command_of(kind: str, case_folder: Path, arguments: list[str], python: str |
     return [python or python_for_runs(), *program, str(case_folder), *arguments]
 
 
-def environment_of(mark: str) -> dict[str, str]:
+def library_environment() -> dict[str, str]:
     """This process's environment, in which the library is found and paths of any language are printed."""
     environment = dict(os.environ)
     paths = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
@@ -64,5 +64,9 @@ def environment_of(mark: str) -> dict[str, str]:
         paths.append(str(LIBRARY_PARENT))
     environment["PYTHONPATH"] = os.pathsep.join(paths)
     environment.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1")
-    environment[MARK_VARIABLE] = mark
     return environment
+
+
+def environment_of(mark: str) -> dict[str, str]:
+    """The environment of a run, which its mark tells from other processes."""
+    return library_environment() | {MARK_VARIABLE: mark}
