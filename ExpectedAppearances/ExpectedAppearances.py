@@ -1,16 +1,16 @@
-"""Module of 3D Slicer that shows registered microscope frames on the models of their case."""
+"""Planning panel of 3D Slicer: from a segmented vessel model to a validated model of one patient."""
 
-import importlib.util
-import logging
 import sys
+from enum import Enum
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
 import slicer
 import vtk
+from slicer import vtkMRMLDisplayableNode, vtkMRMLModelNode, vtkMRMLScalarVolumeNode
 from slicer.i18n import tr as _
 from slicer.i18n import translate
-from slicer.parameterNodeWrapper import parameterNodeWrapper
+from slicer.parameterNodeWrapper import WithinRange, parameterNodeWrapper
 from slicer.ScriptedLoadableModule import (
     ScriptedLoadableModule,
     ScriptedLoadableModuleLogic,
@@ -25,10 +25,6 @@ if not (Path(__file__).resolve().parent / "ExpectedAppearancesLib").is_dir():
     if _root not in sys.path:
         sys.path.append(_root)
 
-# On every node that the panel adds: "frame", or "case:" and the folder of the case.
-SHOWN_ATTRIBUTE = "ExpectedAppearances.Shown"
-SHOWN_FRAME = "frame"
-
 
 class ExpectedAppearances(ScriptedLoadableModule):
     """Description of the module."""
@@ -40,10 +36,12 @@ class ExpectedAppearances(ScriptedLoadableModule):
         parent.dependencies = []
         parent.contributors = ["ExpectedAppearances developers"]
         parent.helpText = _(
-            "Shows microscope frames that the command <i>register</i> has registered to the preoperative models of a "
-            "case: the frame on its image plane, the camera's frustum and the predicted outline of the vessels. "
-            "Frames that the registration refused are not shown. Not for clinical use. See the "
-            '<a href="https://github.com/ExpectedAppearances/SlicerExpectedAppearances">documentation</a>.'
+            "Plans the registration of a surgical microscope to preoperative MRI: from the surface model of the "
+            "cortical vessels it makes expected appearances of the cortex, trains this patient's model on them, and "
+            "says how accurate it is. Work through the sections from above; each says what it still needs. "
+            "Not for clinical use. See the "
+            '<a href="https://github.com/ExpectedAppearances/SlicerExpectedAppearances/blob/main/docs/planning.md">'
+            "guide</a>."
         )
         parent.acknowledgementText = _(
             "Method: N. Haouchine, R. Dorent, P. Juvekar, E. Torio, W. M. Wells III, T. Kapur, A. J. Golby, "
@@ -52,24 +50,122 @@ class ExpectedAppearances(ScriptedLoadableModule):
         )
 
 
+class _Choice(Enum):
+    """A choice in the panel: `value` is stored in settings and options, `label` is shown."""
+
+    def label(self):
+        return _(CHOICE_LABELS[type(self).__name__][self.name])
+
+
+class CameraSource(_Choice):
+    FILE = "file"
+    VIEW = "view"
+
+
+class CraniotomySource(_Choice):
+    FITTED = "fitted"
+    MARKED = "marked"
+    RECORDED = "recorded"
+
+
+class Method(_Choice):
+    SURFACE = "surface"
+    IMAGE = "image"
+
+
+class TrainingPreset(_Choice):
+    QUICK = "quick"
+    BEST = "best"
+    PAPER = "paper"
+
+
+class WhenClosing(_Choice):
+    ASK = "ask"
+    DETACH = "detach"
+    END = "end"
+
+
+CHOICE_LABELS = {
+    "CameraSource": {"FILE": "a calibration file", "VIEW": "field of view and distance"},
+    "CraniotomySource": {
+        "FITTED": "fitted to the models",
+        "MARKED": "a point or curve on the cortex",
+        "RECORDED": "as saved in the case",
+    },
+    "Method": {"SURFACE": "whole surface (recommended)", "IMAGE": "one image for each pose (as in the paper)"},
+    "TrainingPreset": {
+        "QUICK": "quick: for a processor",
+        "BEST": "best: for a graphics card",
+        "PAPER": "paper: for comparison only",
+    },
+    "WhenClosing": {
+        "ASK": "ask (on quitting, work goes on)",
+        "DETACH": "work goes on and is found again",
+        "END": "work is ended; what is finished is kept",
+    },
+}
+
+
 @parameterNodeWrapper
 class ExpectedAppearancesParameterNode:
-    """What the user chose; paths are text, since an empty pathlib.Path would be shown and saved as '.'."""
+    """What the user chose; saved with the scene. Paths are text, since an empty pathlib.Path would be saved as '.'."""
 
+    vesselsNode: vtkMRMLDisplayableNode  # a model or a segmentation
+    vesselsSegmentId: str = ""
+    cortexModel: vtkMRMLModelNode
+    mriVolume: vtkMRMLScalarVolumeNode
     casePath: str = ""
-    posesPath: str = ""
-    frameIndex: int = 0
+
+    cameraSource: CameraSource = CameraSource.FILE
+    calibrationPath: str = ""
+    fieldOfViewMm: Annotated[float, WithinRange(1, 1000)] = 40.0
+    viewedAtMm: Annotated[float, WithinRange(10, 2000)] = 300.0
+    imageWidthPx: Annotated[int, WithinRange(32, 8192)] = 1920
+    imageHeightPx: Annotated[int, WithinRange(32, 8192)] = 1080
+
+    craniotomySource: CraniotomySource = CraniotomySource.FITTED
+    craniotomyNode: vtkMRMLDisplayableNode  # markups: a point list or a closed curve
+    tiltMaxDeg: Annotated[float, WithinRange(0, 90)] = 50.0
+    rollMaxDeg: Annotated[float, WithinRange(0, 180)] = 45.0
+    distanceAuto: bool = True
+    nearestMm: Annotated[float, WithinRange(1, 2000)] = 200.0
+    farthestMm: Annotated[float, WithinRange(1, 2000)] = 400.0
+    lateralAuto: bool = True
+    lateralMm: Annotated[float, WithinRange(0, 100)] = 5.0
+    inViewPercent: Annotated[float, WithinRange(0, 100)] = 60.0
+    poseCount: Annotated[int, WithinRange(1, 10000)] = 100
+    seed: int = 0
+    showCameras: bool = True
+    lookThrough: bool = False
+    poseIndex: Annotated[int, WithinRange(0, 9999)] = 0
+
+    texturesPath: str = ""  # empty: the textures that ship
+
+    method: Method = Method.SURFACE
+    sizePx: Annotated[int, WithinRange(32, 2048)] = 384
+    iterations: Annotated[int, WithinRange(1, 1000)] = 40
+
+    preset: TrainingPreset = TrainingPreset.QUICK
+    device: str = "auto"  # or "cpu", or "cuda:N"
+    minutes: Annotated[float, WithinRange(0.1, 10000)] = 26.0
+
+    addLimitMm: Annotated[float, WithinRange(0.1, 100)] = 3.0
+    accuracyLimitPercent: Annotated[float, WithinRange(0, 100)] = 80.0
+    acceptedLimitPercent: Annotated[float, WithinRange(0, 100)] = 50.0
+
+    whenClosing: WhenClosing = WhenClosing.ASK
 
 
 class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixin):
-    """The panel: chooses, and says why it cannot show."""
+    """The panel: loads the .ui and hands everything else to PlanningPanel."""
 
     def __init__(self, parent=None):
         ScriptedLoadableModuleWidget.__init__(self, parent)
         VTKObservationMixin.__init__(self)
         self.logic = None
+        self.panel = None
         self._parameterNode = None
-        self._parameterNodeGuiTag = None
+        self._guiTag = None
 
     def setup(self):
         ScriptedLoadableModuleWidget.setup(self)
@@ -77,24 +173,34 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         self.layout.addWidget(uiWidget)
         self.ui = slicer.util.childWidgetVariables(uiWidget)
         uiWidget.setMRMLScene(slicer.mrmlScene)
-        self.logic = ExpectedAppearancesLogic()
 
-        self.ui.casePathLineEdit.connect("currentPathChanged(QString)", self.onPathChanged)
-        self.ui.posesPathLineEdit.connect("currentPathChanged(QString)", self.onPathChanged)
-        self.ui.showButton.connect("clicked(bool)", self.onShow)
-        self.addObserver(slicer.mrmlScene, slicer.mrmlScene.StartCloseEvent, self.onSceneStartClose)
-        self.addObserver(slicer.mrmlScene, slicer.mrmlScene.EndCloseEvent, self.onSceneEndClose)
+        from ExpectedAppearancesLib.widgets.planning_panel import PlanningPanel
+
+        self.logic = ExpectedAppearancesLogic()
+        self.panel = PlanningPanel(self.ui, self.logic.session, slicer.mrmlScene)
+        scene = slicer.mrmlScene
+        self.addObserver(scene, scene.StartCloseEvent, self.onSceneStartClose)
+        self.addObserver(scene, scene.EndCloseEvent, self.onSceneEndClose)
+        self.addObserver(scene, scene.EndImportEvent, self.onSceneEndImport)
+        slicer.app.connect("aboutToQuit()", self.onQuit)
         self.initializeParameterNode()
+        if self.parent.isEntered:  # reloaded while it was shown
+            self.panel.enter()
 
     def cleanup(self):
+        if self.panel is None:
+            return
+        slicer.app.disconnect("aboutToQuit()", self.onQuit)
         self.setParameterNode(None)
+        self.panel.cleanup()
         self.removeObservers()
 
     def enter(self):
         self.initializeParameterNode()
+        self.panel.enter()
 
     def exit(self):
-        self.setParameterNode(None)
+        self.panel.exit()
 
     def onReload(self):
         for name in [name for name in sys.modules if name.split(".")[0] == "ExpectedAppearancesLib"]:
@@ -102,306 +208,60 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         ScriptedLoadableModuleWidget.onReload(self)
 
     def onSceneStartClose(self, _caller, _event):
+        self.panel.closing_scene()
         self.setParameterNode(None)
 
     def onSceneEndClose(self, _caller, _event):
-        self.logic.hideAll()
-        if self.parent.isEntered:
-            self.initializeParameterNode()
+        self.initializeParameterNode()
+
+    def onSceneEndImport(self, _caller, _event):
+        self.initializeParameterNode()
+
+    def onQuit(self):
+        self.panel.quitting()
 
     def initializeParameterNode(self):
         self.setParameterNode(self.logic.getParameterNode())
 
     def setParameterNode(self, parameterNode):
         if self._parameterNode:
-            self._parameterNode.disconnectGui(self._parameterNodeGuiTag)
+            self._parameterNode.disconnectGui(self._guiTag)
             self.removeObserver(self._parameterNode, vtk.vtkCommand.ModifiedEvent, self.onParameterNodeModified)
         self._parameterNode = parameterNode
-        if self._parameterNode:
-            self._parameterNodeGuiTag = self._parameterNode.connectGui(self.ui)
-            self.addObserver(self._parameterNode, vtk.vtkCommand.ModifiedEvent, self.onParameterNodeModified)
-            self.onParameterNodeModified()
+        self.panel.set_parameters(parameterNode, lambda: self._connectGui(parameterNode))
 
-    def onPathChanged(self, _path=None):
-        if not self._parameterNode:
-            return
-        casePath, posesPath = self.ui.casePathLineEdit.currentPath, self.ui.posesPathLineEdit.currentPath
-        # What is shown does not belong to the new choice.
-        if casePath != self._parameterNode.casePath:
-            self.logic.hideAll()
-        elif posesPath != self._parameterNode.posesPath:
-            self.logic.hideFrame()
-        self._parameterNode.casePath = casePath
-        self._parameterNode.posesPath = posesPath
+    def _connectGui(self, parameterNode):
+        self._guiTag = parameterNode.connectGui(self.ui)
+        self.addObserver(parameterNode, vtk.vtkCommand.ModifiedEvent, self.onParameterNodeModified)
 
     def onParameterNodeModified(self, _caller=None, _event=None):
-        casePath, posesPath = self._parameterNode.casePath, self._parameterNode.posesPath
-        for lineEdit, path in ((self.ui.casePathLineEdit, casePath), (self.ui.posesPathLineEdit, posesPath)):
-            if lineEdit.currentPath != path:
-                wasBlocked = lineEdit.blockSignals(True)
-                lineEdit.currentPath = path
-                lineEdit.blockSignals(wasBlocked)
-        problem = self.logic.problem(casePath, posesPath)
-        if not problem:
-            self.ui.frameSpinBox.setRange(0, self.logic.frameCount(posesPath) - 1)
-        self.ui.frameSpinBox.enabled = not problem
-        self.ui.showButton.enabled = not problem
-        self.ui.showButton.toolTip = problem or _("Show the frame in the 3D view and in the Red slice view.")
-        self.ui.statusLabel.text = problem or self.logic.message
-
-    def onShow(self):
-        parameters = self._parameterNode
-        # Unexpected errors are shown and logged; expected ones come back as text.
-        with slicer.util.tryWithErrorDisplay(_("The frame could not be shown."), waitCursor=True):
-            self.logic.show(parameters.casePath, parameters.posesPath, parameters.frameIndex)
-        self.ui.statusLabel.text = self.logic.message
+        self.panel.refresh_soon()
 
 
 class ExpectedAppearancesLogic(ScriptedLoadableModuleLogic):
-    """Checks what was chosen and shows one frame; knows no Qt."""
+    """Parameters of the panel, and the session that works on them; knows no Qt."""
 
     def __init__(self):
         ScriptedLoadableModuleLogic.__init__(self)
-        self.message = ""  # what the last show() has to tell the user
-        self._posesRead = None  # (path, time of change), frames: the panel asks again at each change
+        from ExpectedAppearancesLib.mrml.planning_session import PlanningSession
+
+        self.session = PlanningSession()
 
     def getParameterNode(self):
         return ExpectedAppearancesParameterNode(super().getParameterNode())
 
-    def problem(self, casePath, posesPath):
-        """Why nothing can be shown, or ''."""
-        from ExpectedAppearancesLib.errors import InputError
-
-        if not casePath:
-            return _("Choose a case folder.")
-        if not (Path(casePath) / "case.json").is_file():
-            return _("{path} is not a case folder: it holds no case.json.").format(path=casePath)
-        if not posesPath:
-            return _("Choose the poses.json that the command register wrote.")
-        try:
-            self._readPoses(posesPath)
-        except InputError as error:
-            return str(error)
-        if importlib.util.find_spec("cv2") is None:
-            return _(
-                "OpenCV is not installed in this Slicer. Install it in the Python console with "
-                "slicer.util.pip_install('opencv-python-headless')."
-            )
-        return ""
-
-    def frameCount(self, posesPath):
-        return len(self._readPoses(posesPath)[1])
-
-    def show(self, casePath, posesPath, index):
-        """Show one frame in the place of the last; `message` says what was done. True if the frame is shown.
-
-        A frame that registration refused is not shown, and neither is one with an error: nothing old stays.
-        """
-        from ExpectedAppearancesLib.case.case import Case
-        from ExpectedAppearancesLib.errors import ExpectedAppearancesError
-
-        self.hideFrame()
-        shown = False
-        try:
-            camera, frames = self._readPoses(posesPath)
-            if not 0 <= index < len(frames):
-                self.message = _("There is no frame {index}; the poses file has {count}.").format(
-                    index=index, count=len(frames)
-                )
-                return False
-            frame = frames[index]
-            names = {"index": index, "name": frame.image.name}
-            if not frame.accepted:
-                self.message = _("Frame {index} ({name}) was refused by the registration and is not shown.").format(
-                    **names
-                )
-                return False
-            case = Case.open(casePath)
-            self._showCase(case)
-            self._showFrame(case, camera or case.camera, frame)
-            self.message = _("Frame {index} ({name}) is shown.").format(**names)
-            shown = True
-        except ExpectedAppearancesError as error:
-            logging.warning("Expected Appearances: %s", error)
-            self.message = str(error)
-        finally:
-            if not shown:
-                self._removeShown(lambda mark: mark == SHOWN_FRAME)
-        return shown
-
-    def hideFrame(self):
-        self.message = ""
-        self._removeShown(lambda mark: mark == SHOWN_FRAME)
-
-    def hideAll(self):
-        self.message = ""
-        self._removeShown(lambda _mark: True)
-
-    def _showCase(self, case):
-        from ExpectedAppearancesLib.mrml import scene
-
-        key = "case:" + case.folder.as_posix()
-        self._removeShown(lambda mark: mark.startswith("case:") and mark != key)
-        if key not in self._shown().values():
-            self._addMarked(key, lambda: scene.add_case_models(slicer.mrmlScene, case))
-
-    def _showFrame(self, case, camera, frame):
-        from ExpectedAppearancesLib import files
-        from ExpectedAppearancesLib.geometry.pose import camera_to_ras
-        from ExpectedAppearancesLib.geometry.silhouette import Silhouette
-        from ExpectedAppearancesLib.mrml import scene
-
-        image = files.read_image_rgb(frame.image)
-        camera = camera.resized(image.shape[1], image.shape[0])
-        pose = frame.camera_from_world
-        plane_mm = scene.plane_depth_mm(case.vessels, pose)
-        cameraToRas = camera_to_ras(pose, case.space)
-        silhouette = Silhouette(case.vessels.vertices_mm, case.vessels.triangles)
-
-        def add():
-            parent = scene.add_camera_transform(slicer.mrmlScene, cameraToRas)
-            volume = scene.add_frame(slicer.mrmlScene, image, camera, plane_mm, parent)
-            scene.add_frustum(slicer.mrmlScene, camera, plane_mm, parent)
-            scene.add_outline(slicer.mrmlScene, silhouette, pose, plane_mm, parent)
-            return volume
-
-        volume = self._addMarked(SHOWN_FRAME, add)
-        self._lookAtFrame(volume, camera, plane_mm, cameraToRas)
-
-    def _lookAtFrame(self, volume, camera, plane_mm, cameraToRas):
-        """Turn the Red slice, where there is one, to the image plane, and draw it in 3D."""
-        from ExpectedAppearancesLib.mrml import scene
-
-        sliceNode = slicer.mrmlScene.GetNodeByID("vtkMRMLSliceNodeRed")
-        compositeNode = slicer.mrmlScene.GetNodeByID("vtkMRMLSliceCompositeNodeRed")
-        if sliceNode is None or compositeNode is None:
-            return
-        planeToCamera = np.diag([1.0, -1.0, -1.0, 1.0])  # the slice's y points up, the camera's down
-        # Slice views sample at the corners of their pixels: with this pixel at the origin the frame stays sharp.
-        planeToCamera[:, 3] = scene.camera_from_pixel(camera, plane_mm) @ [
-            camera.width / 2,
-            camera.height / 2 - 1,
-            0,
-            1,
-        ]
-        slicer.util.updateVTKMatrixFromArray(sliceNode.GetSliceToRAS(), cameraToRas @ planeToCamera)
-        sliceNode.UpdateMatrices()
-        width, height = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
-        viewWidth, viewHeight = sliceNode.GetDimensions()[:2]
-        # The whole frame in the view, with square pixels whatever the view's shape.
-        mmPerPixel = max(width / max(viewWidth, 1), height / max(viewHeight, 1))
-        sliceNode.SetFieldOfView(mmPerPixel * viewWidth, mmPerPixel * viewHeight, sliceNode.GetFieldOfView()[2])
-        sliceNode.SetSliceVisible(True)
-        compositeNode.SetBackgroundVolumeID(volume.GetID())
-
-    def _addMarked(self, mark, add):
-        """Run `add` and mark all nodes that it added, display nodes too, also when it fails."""
-        before = {node.GetID() for node in self._nodes()}
-        try:
-            return add()
-        finally:
-            for node in self._nodes():
-                if node.GetID() not in before:
-                    node.SetAttribute(SHOWN_ATTRIBUTE, mark)
-
-    def _removeShown(self, matches):
-        for node, mark in self._shown().items():
-            if matches(mark) and slicer.mrmlScene.IsNodePresent(node):
-                slicer.mrmlScene.RemoveNode(node)
-
-    def _shown(self):
-        marks = {node: node.GetAttribute(SHOWN_ATTRIBUTE) for node in self._nodes()}
-        return {node: mark for node, mark in marks.items() if mark}
-
-    def _nodes(self):
-        collection = slicer.mrmlScene.GetNodes()
-        return [collection.GetItemAsObject(i) for i in range(collection.GetNumberOfItems())]
-
-    def _readPoses(self, posesPath):
-        from ExpectedAppearancesLib.registration.poses_file import read_poses
-
-        path = Path(posesPath)
-        version = (posesPath, path.stat().st_mtime_ns if path.is_file() else None)
-        if self._posesRead is None or self._posesRead[0] != version:
-            self._posesRead = (version, read_poses(path))
-        return self._posesRead[1]
-
 
 class ExpectedAppearancesTest(ScriptedLoadableModuleTest):
-    """Clicks through the panel on empty input and on a generated case."""
+    """The panel in a real Slicer; the tests themselves are in the library, beside what they test."""
 
     def setUp(self):
         slicer.mrmlScene.Clear()
 
     def runTest(self):
-        self.setUp()
-        self.test_panelSaysWhyItIsDisabled()
-        self.setUp()
-        self.test_showsAcceptedFramesOnly()
+        from ExpectedAppearancesLib.widgets import planning_selftest
 
-    def test_panelSaysWhyItIsDisabled(self):
-        widget = slicer.util.getModuleWidget("ExpectedAppearances")
-        if slicer.util.mainWindow(verbose=False):
-            slicer.util.selectModule("ExpectedAppearances")
-        else:
-            widget.enter()
-        widget.ui.casePathLineEdit.currentPath = ""
-        widget.ui.posesPathLineEdit.currentPath = ""
-        self.assertFalse(widget.ui.showButton.enabled)
-        self.assertEqual(widget.ui.statusLabel.text, _("Choose a case folder."))
-
-        folder = Path(slicer.app.temporaryPath)
-        widget.ui.casePathLineEdit.currentPath = str(folder)
-        self.assertFalse(widget.ui.showButton.enabled)
-        self.assertIn("case.json", widget.ui.statusLabel.text)
-        widget.ui.casePathLineEdit.currentPath = ""
-
-    def test_showsAcceptedFramesOnly(self):
-        if importlib.util.find_spec("cv2") is None:
-            self.delayDisplay("Skipped: OpenCV is not installed in this Slicer.")
-            return
-        import tempfile
-
-        with tempfile.TemporaryDirectory() as folder:
-            self._showGeneratedCase(Path(folder))
+        for test in planning_selftest.TESTS:
+            self.setUp()
+            self.delayDisplay(test.__name__)
+            test(self)
         self.delayDisplay("Test passed")
-
-    def _showGeneratedCase(self, folder):
-        casePath, posesPath = _writeTinyCase(folder)
-        logic = ExpectedAppearancesLogic()
-        self.assertEqual(logic.problem(casePath, posesPath), "")
-        self.assertEqual(logic.frameCount(posesPath), 2)
-
-        for _repeat in range(2):
-            self.assertTrue(logic.show(casePath, posesPath, 0), logic.message)
-            self.assertEqual(self._frameVolumes(), 1)
-        self.assertFalse(logic.show(casePath, posesPath, 1))
-        self.assertIn("refused.png", logic.message)
-        self.assertEqual(self._frameVolumes(), 0)
-
-    def _frameVolumes(self):
-        return slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLVectorVolumeNode")
-
-
-def _writeTinyCase(folder):
-    """A sphere seen from 300 mm, in an accepted and a refused frame; paths of the case and of its poses."""
-    from ExpectedAppearancesLib import files
-    from ExpectedAppearancesLib.case.case import Case
-    from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
-    from ExpectedAppearancesLib.geometry.camera import Camera
-    from ExpectedAppearancesLib.geometry.pose import look_at
-    from ExpectedAppearancesLib.registration.poses_file import write_poses
-
-    source = vtk.vtkSphereSource()
-    source.SetRadius(15.0)
-    source.Update()
-    write_vtp(folder / "sphere.vtp", Mesh.from_polydata(source.GetOutput()))
-    camera = Camera(64, 48, 90.0, 90.0, 33.0, 22.0)
-    case = Case.create(folder / "case", folder / "sphere.vtp", None, camera)
-    pose = look_at(np.array([0.0, 0.0, 300.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
-    frames = []
-    for name, accepted in (("accepted.png", True), ("refused.png", False)):
-        files.write_png(folder / name, np.full((48, 64, 3), 128, np.uint8))
-        frames.append({"image": folder / name, "camera_from_world": pose, "accepted": accepted})
-    write_poses(folder / "poses.json", camera, frames)
-    return str(case.folder), str(folder / "poses.json")

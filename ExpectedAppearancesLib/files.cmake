@@ -11,6 +11,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/appearances/lbfgs.py
   ExpectedAppearancesLib/appearances/measure.py
   ExpectedAppearancesLib/appearances/overview.py
+  ExpectedAppearancesLib/appearances/projection.py
   ExpectedAppearancesLib/appearances/shards.py
   ExpectedAppearancesLib/appearances/stage.py
   ExpectedAppearancesLib/appearances/store.py
@@ -19,10 +20,14 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/appearances/workload.py
   ExpectedAppearancesLib/augmentation/__init__.py
   ExpectedAppearancesLib/augmentation/elastic.py
+  ExpectedAppearancesLib/augmentation/impostors.py
   ExpectedAppearancesLib/augmentation/microscope.py
+  ExpectedAppearancesLib/augmentation/surroundings.py
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py
+  ExpectedAppearancesLib/case/recorded.py
+  ExpectedAppearancesLib/case/steps.py
   ExpectedAppearancesLib/cli/__init__.py
   ExpectedAppearancesLib/cli/check.py
   ExpectedAppearancesLib/cli/demo.py
@@ -32,10 +37,12 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/cli/progress.py
   ExpectedAppearancesLib/cli/register.py
   ExpectedAppearancesLib/cli/render.py
+  ExpectedAppearancesLib/cli/study.py
   ExpectedAppearancesLib/cli/synthesize.py
   ExpectedAppearancesLib/cli/train.py
   ExpectedAppearancesLib/demo/__init__.py
   ExpectedAppearancesLib/demo/frames.py
+  ExpectedAppearancesLib/demo/phantom.py
   ExpectedAppearancesLib/demo/pipeline.py
   ExpectedAppearancesLib/demo/vessel_tree.py
   ExpectedAppearancesLib/devices.py
@@ -45,13 +52,36 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/evaluate.py
   ExpectedAppearancesLib/evaluation/metrics.py
   ExpectedAppearancesLib/evaluation/overlays.py
+  ExpectedAppearancesLib/evaluation/perturbations.py
   ExpectedAppearancesLib/evaluation/report.py
+  ExpectedAppearancesLib/evaluation/robustness.py
+  ExpectedAppearancesLib/evaluation/study.py
+  ExpectedAppearancesLib/evaluation/study_figures.py
+  ExpectedAppearancesLib/evaluation/study_folds.py
+  ExpectedAppearancesLib/evaluation/study_report.py
+  ExpectedAppearancesLib/evaluation/verdict.py
+  ExpectedAppearancesLib/executor.py
   ExpectedAppearancesLib/files.py
   ExpectedAppearancesLib/geometry/__init__.py
   ExpectedAppearancesLib/geometry/camera.py
   ExpectedAppearancesLib/geometry/pose.py
+  ExpectedAppearancesLib/geometry/se3.py
   ExpectedAppearancesLib/geometry/silhouette.py
+  ExpectedAppearancesLib/gpus.py
+  ExpectedAppearancesLib/live/__init__.py
+  ExpectedAppearancesLib/live/alignment.py
+  ExpectedAppearancesLib/live/choice.py
+  ExpectedAppearancesLib/live/estimator.py
+  ExpectedAppearancesLib/live/feed.py
+  ExpectedAppearancesLib/live/frames.py
+  ExpectedAppearancesLib/live/overlay.py
+  ExpectedAppearancesLib/live/recording.py
+  ExpectedAppearancesLib/live/session.py
+  ExpectedAppearancesLib/live/sources.py
+  ExpectedAppearancesLib/live/trust.py
+  ExpectedAppearancesLib/live/worker.py
   ExpectedAppearancesLib/masks/__init__.py
+  ExpectedAppearancesLib/masks/exposed.py
   ExpectedAppearancesLib/masks/labels.py
   ExpectedAppearancesLib/masks/renderer.py
   ExpectedAppearancesLib/masks/stage.py
@@ -60,31 +90,88 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/model/encoding.py
   ExpectedAppearancesLib/model/export.py
   ExpectedAppearancesLib/model/feeder.py
+  ExpectedAppearancesLib/model/fold.py
   ExpectedAppearancesLib/model/losses.py
   ExpectedAppearancesLib/model/networks.py
   ExpectedAppearancesLib/model/presets.py
   ExpectedAppearancesLib/model/training.py
   ExpectedAppearancesLib/model/views.py
   ExpectedAppearancesLib/mrml/__init__.py
+  ExpectedAppearancesLib/mrml/charts.py
+  ExpectedAppearancesLib/mrml/labelling.py
+  ExpectedAppearancesLib/mrml/live_align.py
+  ExpectedAppearancesLib/mrml/live_banner.py
+  ExpectedAppearancesLib/mrml/live_controller.py
+  ExpectedAppearancesLib/mrml/live_record.py
+  ExpectedAppearancesLib/mrml/live_scene.py
+  ExpectedAppearancesLib/mrml/live_stream.py
+  ExpectedAppearancesLib/mrml/live_views.py
+  ExpectedAppearancesLib/mrml/planning.py
+  ExpectedAppearancesLib/mrml/planning_adopt.py
+  ExpectedAppearancesLib/mrml/planning_session.py
   ExpectedAppearancesLib/mrml/scene.py
   ExpectedAppearancesLib/poses/__init__.py
   ExpectedAppearancesLib/poses/craniotomy.py
   ExpectedAppearancesLib/poses/sampling.py
   ExpectedAppearancesLib/registration/__init__.py
   ExpectedAppearancesLib/registration/confidence.py
+  ExpectedAppearancesLib/registration/covariance.py
   ExpectedAppearancesLib/registration/decoding.py
+  ExpectedAppearancesLib/registration/footage.py
   ExpectedAppearancesLib/registration/pnp.py
   ExpectedAppearancesLib/registration/poses_file.py
   ExpectedAppearancesLib/registration/predictor.py
   ExpectedAppearancesLib/registration/record.py
+  ExpectedAppearancesLib/registration/refinement.py
+  ExpectedAppearancesLib/registration/tracking.py
+  ExpectedAppearancesLib/runs/__init__.py
+  ExpectedAppearancesLib/runs/closing.py
+  ExpectedAppearancesLib/runs/command_line_module.py
+  ExpectedAppearancesLib/runs/dependencies.py
+  ExpectedAppearancesLib/runs/environment.py
+  ExpectedAppearancesLib/runs/output.py
+  ExpectedAppearancesLib/runs/pip_words.py
+  ExpectedAppearancesLib/runs/processes.py
+  ExpectedAppearancesLib/runs/record.py
+  ExpectedAppearancesLib/runs/results.py
+  ExpectedAppearancesLib/runs/runner.py
+  ExpectedAppearancesLib/runs/state.py
+  ExpectedAppearancesLib/runs/system_report.py
   ExpectedAppearancesLib/textures/__init__.py
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
+  ExpectedAppearancesLib/textures/proposal.py
+  ExpectedAppearancesLib/widgets/__init__.py
+  ExpectedAppearancesLib/widgets/live_align.py
+  ExpectedAppearancesLib/widgets/live_install.py
+  ExpectedAppearancesLib/widgets/live_layout.py
+  ExpectedAppearancesLib/widgets/live_panel.py
+  ExpectedAppearancesLib/widgets/live_record.py
+  ExpectedAppearancesLib/widgets/live_sample.py
+  ExpectedAppearancesLib/widgets/live_selftest.py
+  ExpectedAppearancesLib/widgets/live_source.py
+  ExpectedAppearancesLib/widgets/live_status.py
+  ExpectedAppearancesLib/widgets/live_texts.py
+  ExpectedAppearancesLib/widgets/planning_appearances.py
+  ExpectedAppearancesLib/widgets/planning_case.py
+  ExpectedAppearancesLib/widgets/planning_devices.py
+  ExpectedAppearancesLib/widgets/planning_help.py
+  ExpectedAppearancesLib/widgets/planning_labelling.py
+  ExpectedAppearancesLib/widgets/planning_panel.py
+  ExpectedAppearancesLib/widgets/planning_poses.py
+  ExpectedAppearancesLib/widgets/planning_qt.py
+  ExpectedAppearancesLib/widgets/planning_run.py
+  ExpectedAppearancesLib/widgets/planning_section.py
+  ExpectedAppearancesLib/widgets/planning_selftest.py
+  ExpectedAppearancesLib/widgets/planning_textures.py
+  ExpectedAppearancesLib/widgets/planning_training.py
+  ExpectedAppearancesLib/widgets/planning_validation.py
   )
 set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md
   ExpectedAppearancesLib/appearances/weights/vgg16_imagenet_to_conv5_1_fp16.safetensors
+  ExpectedAppearancesLib/demo/phantom.onnx
   ExpectedAppearancesLib/textures/generated/apricot.labels.png
   ExpectedAppearancesLib/textures/generated/apricot.png
   ExpectedAppearancesLib/textures/generated/blush.labels.png

@@ -76,10 +76,17 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 
 def read_image_rgb(path: Path) -> np.ndarray:
-    """Image file (PNG, JPEG, TIFF, 8 or 16 bit, grey or colour) as uint8 RGB (H, W, 3). Raises InputError."""
+    """Image file (PNG, JPEG, TIFF, 8 or 16 bit, grey or colour) as uint8 RGB (H, W, 3). Raises InputError.
+
+    VIDEO#frame=N, as `register` writes, is frame N of a video.
+    """
     import cv2
 
     path = Path(path)
+    if "#frame=" in path.name and not path.is_file():
+        from .registration.footage import read_video_frame
+
+        return read_video_frame(path)
     if not path.is_file():
         raise InputError(f"{path}: image not found; check the path.")
     # Through bytes: cv2.imread fails on non-ASCII paths on Windows.

@@ -67,7 +67,7 @@ class ShiftedPredictor:
         assert camera == CAMERA
         i = int(image_rgb[0, 0, 0])
         pose = None if i == FRAMES - 1 else pose_from_rotation(np.eye(3), (float(i), 0, 0)) @ self.poses[i]
-        return SimpleNamespace(camera_from_world=pose, accepted=i < 4, confidence=0.5, latency_ms=7.0)
+        return SimpleNamespace(camera_from_world=pose, accepted=i < 4, confidence=0.5, latency_ms=7.0, covariance=None)
 
 
 def test_evaluate_writes_everything_and_the_figures_are_right(case, known, tmp_path):

@@ -1,24 +1,26 @@
-"""The Slicer extension: what is packaged, how it is described, and its module on a real MRML scene."""
+"""The Slicer extension: what is packaged, how it is described, and what its panels need of each other's files."""
 
 from __future__ import annotations
 
 import ast
-import importlib
-import importlib.util
 import json
 import re
+import subprocess
 import sys
-import types
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-import numpy as np
 import pytest
 from package_files import HEADER, LIST, library_files
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULE = ROOT / "ExpectedAppearances" / "ExpectedAppearances.py"
-UI = ROOT / "ExpectedAppearances" / "Resources" / "UI" / "ExpectedAppearances.ui"
+FOLDER = ROOT / "ExpectedAppearances"
+MODULE = FOLDER / "ExpectedAppearances.py"
+MODULES = sorted(FOLDER.glob("*.py"))
+WIDGETS = ROOT / "ExpectedAppearancesLib" / "widgets"
+# The parts of each panel: which files of the library's widgets it is made of.
+PARTS = {"ExpectedAppearances": "planning_*.py", "ExpectedAppearancesLive": "live_*.py"}
+CLI_FOLDERS = sorted(path.parent for path in MODULE.parent.glob("*/CMakeLists.txt"))
 SHARED_ENTRIES = ("homepage", "contributors", "description", "category", "iconurl", "screenshoturls", "depends")
 ALLOWED_IMPORTS = {"slicer", "vtk", "numpy", "qt", "ctk"} | set(sys.stdlib_module_names)
 
@@ -39,12 +41,28 @@ def s4ext_entries() -> dict:
     return dict(line.split(" ", 1) for line in lines if line and not line.startswith("#"))
 
 
-def ui_root() -> ElementTree.Element:
-    return ElementTree.parse(UI).getroot()
+def listed_files(lists: Path) -> list[str]:
+    """Scripts and resources of every module that a CMakeLists.txt builds, ${MODULE_NAME} filled in."""
+    found, name = [], ""
+    for variable, value in re.findall(r"set\((\w+)\s+(.*?)\)", lists.read_text(encoding="utf-8"), re.DOTALL):
+        if variable == "MODULE_NAME":
+            name = value.strip()
+        else:
+            found += value.replace("${MODULE_NAME}", name).split()
+    return found
 
 
-def ui_names() -> set[str]:
-    return {widget.get("name") for widget in ui_root().iter("widget")}
+def ui_root(module: Path) -> ElementTree.Element:
+    return ElementTree.parse(FOLDER / "Resources" / "UI" / f"{module.stem}.ui").getroot()
+
+
+def panel_source(module: Path) -> str:
+    files = [module, *sorted(WIDGETS.glob(PARTS[module.stem]))]
+    return "\n".join(path.read_text(encoding="utf-8") for path in files)
+
+
+def every_module(test):
+    return pytest.mark.parametrize("module", MODULES, ids=lambda path: path.stem)(test)
 
 
 def test_every_file_of_the_library_is_packaged():
@@ -60,13 +78,22 @@ def test_every_file_of_the_library_is_packaged():
     assert LIST.read_text(encoding="utf-8").startswith(HEADER)
 
 
-def test_every_file_of_the_module_is_packaged():
-    folder = MODULE.parent
-    lists = folder / "CMakeLists.txt"
-    listed = cmake_list(lists, "MODULE_PYTHON_SCRIPTS") + cmake_list(lists, "MODULE_PYTHON_RESOURCES")
-    listed = {name.replace("${MODULE_NAME}", folder.name) for name in listed}
-    paths = [path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    assert listed == {path.relative_to(folder).as_posix() for path in paths} - {"CMakeLists.txt"}
+def test_every_file_of_the_modules_is_packaged_once():
+    listed = listed_files(FOLDER / "CMakeLists.txt")
+    paths = [path for path in FOLDER.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    # A command-line module in a folder of its own has a list of its own.
+    paths = [path for path in paths if path.parent not in CLI_FOLDERS]
+    assert sorted(listed) == sorted({path.relative_to(FOLDER).as_posix() for path in paths} - {"CMakeLists.txt"})
+
+
+def test_every_command_line_module_is_built():
+    lists = (MODULE.parent / "CMakeLists.txt").read_text(encoding="utf-8")
+    assert CLI_FOLDERS and re.findall(r"add_subdirectory\((\w+)\)", lists) == [f.name for f in CLI_FOLDERS]
+    for folder in CLI_FOLDERS:
+        own = (folder / "CMakeLists.txt").read_text(encoding="utf-8")
+        assert f"set(MODULE_NAME {folder.name})" in own and "SlicerMacroBuildScriptedCLI(" in own
+        files = {path.name for path in folder.iterdir() if path.is_file()}
+        assert files == {"CMakeLists.txt", f"{folder.name}.py", f"{folder.name}.xml"}
 
 
 def test_descriptions_agree():
@@ -87,12 +114,15 @@ def test_descriptions_agree():
     assert index["$schema"].endswith("schema-v1.0.1.json#")
 
 
-def test_descriptions_agree_with_the_module():
-    source = MODULE.read_text(encoding="utf-8")
+@every_module
+def test_descriptions_agree_with_the_modules(module):
+    source = module.read_text(encoding="utf-8")
     cmake = cmake_entries()
     assert f'parent.contributors = ["{cmake["contributors"]}"]' in source
     assert f'translate("qSlicerAbstractCoreModule", "{cmake["category"]}")' in source
-    assert f'"{cmake["homepage"]}"' in source
+    assert cmake["homepage"] in source
+    assert "MICCAI 2023" in source
+    assert "Not for clinical use" in source or "not for clinical use" in source.lower()
 
 
 def test_icon_url_names_a_file_of_the_repository():
@@ -100,9 +130,15 @@ def test_icon_url_names_a_file_of_the_repository():
     assert (ROOT / path).read_bytes().startswith(b"\x89PNG")
 
 
-def test_module_imports_only_what_slicer_has():
+@every_module
+def test_every_module_has_its_icon(module):
+    assert (FOLDER / "Resources" / "Icons" / f"{module.stem}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@every_module
+def test_module_imports_only_what_slicer_has(module):
     imported = set()
-    for node in ast.parse(MODULE.read_text(encoding="utf-8")).body:
+    for node in ast.parse(module.read_text(encoding="utf-8")).body:
         for inner in ast.walk(node) if isinstance(node, (ast.If, ast.Try, ast.With)) else [node]:
             if isinstance(inner, ast.Import):
                 imported |= {alias.name.split(".")[0] for alias in inner.names}
@@ -112,8 +148,9 @@ def test_module_imports_only_what_slicer_has():
     assert "slicer" in imported
 
 
-def test_logic_knows_no_qt():
-    tree = ast.parse(MODULE.read_text(encoding="utf-8"))
+@every_module
+def test_logic_knows_no_qt(module):
+    tree = ast.parse(module.read_text(encoding="utf-8"))
     logic = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name.endswith("Logic"))
     names = {node.id for node in ast.walk(logic) if isinstance(node, ast.Name)}
     attributes = {node.attr for node in ast.walk(logic) if isinstance(node, ast.Attribute)}
@@ -121,139 +158,86 @@ def test_logic_knows_no_qt():
     assert not {"app", "ui"} & attributes
 
 
-def test_panel_has_every_widget_that_the_code_uses():
-    used = set(re.findall(r"\bui\.(\w+)", MODULE.read_text(encoding="utf-8")))
+@every_module
+def test_panel_has_every_widget_that_the_code_uses(module):
+    named = {widget.get("name") for widget in ui_root(module).iter("widget")}
+    used = set(re.findall(r"\bui\.(\w+)", panel_source(module)))
     assert len(used) >= 5
-    assert used <= ui_names()
-    assert ui_root().find("widget").get("class") == "qMRMLWidget"
+    assert used <= named, used - named
+    assert ui_root(module).find("widget").get("class") == "qMRMLWidget"
 
 
-def test_panel_starts_disabled_and_names_parameters_that_exist():
-    enabled = {w.get("name"): w.findtext("property[@name='enabled']/bool") for w in ui_root().iter("widget")}
-    assert enabled["showButton"] == "false"
-    bound = [p.findtext("string") for p in ui_root().iter("property") if p.get("name") == "SlicerParameterName"]
-    tree = ast.parse(MODULE.read_text(encoding="utf-8"))
+def test_every_planning_step_has_its_section():
+    from ExpectedAppearancesLib.case.steps import STEPS
+
+    named = {widget.get("name") for widget in ui_root(MODULE).iter("widget")}
+    assert {f"{step}{part}" for step in STEPS for part in ("Section", "Status")} <= named
+
+
+@every_module
+def test_panel_names_parameters_that_exist(module):
+    bound = [p.findtext("string") for p in ui_root(module).iter("property") if p.get("name") == "SlicerParameterName"]
+    tree = ast.parse(module.read_text(encoding="utf-8"))
     node = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name.endswith("ParameterNode"))
     parameters = {n.target.id for n in node.body if isinstance(n, ast.AnnAssign)}
-    assert bound and set(bound) <= parameters
+    assert len(set(bound)) == len(bound)
+    assert set(bound) <= parameters, set(bound) - parameters
 
 
-@pytest.fixture
-def module(monkeypatch):
-    """The module on slicer-core's MRML, with stand-ins for the parts of Slicer that need Qt."""
-    slicer = pytest.importorskip("slicer")
-
-    class Base:
-        def __init__(self, parent=None):
-            pass
-
-    names = ["", "Logic", "Widget", "Test"]
-    stand_ins = {
-        "i18n": {"tr": lambda text: text, "translate": lambda _context, text: text},
-        "parameterNodeWrapper": {"parameterNodeWrapper": lambda cls: cls},
-        "ScriptedLoadableModule": {f"ScriptedLoadableModule{name}": type(name, (Base,), {}) for name in names},
-    }
-    for name, values in stand_ins.items():
-        stand_in = types.ModuleType(f"slicer.{name}")
-        vars(stand_in).update(values)
-        monkeypatch.setitem(sys.modules, stand_in.__name__, stand_in)
-    importlib.import_module("slicer.util")
-    monkeypatch.setattr(slicer.util, "VTKObservationMixin", type("Mixin", (), {}), raising=False)
-    monkeypatch.setattr(slicer, "mrmlScene", slicer.vtkMRMLScene(), raising=False)
-    spec = importlib.util.spec_from_file_location("ExpectedAppearancesModule", MODULE)
-    loaded = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    return loaded
+def test_every_number_of_the_planning_panel_has_its_unit():
+    for widget in ui_root(MODULE).iter("widget"):
+        if widget.get("class") in ("QSpinBox", "QDoubleSpinBox", "ctkSliderWidget"):
+            assert widget.findtext("property[@name='suffix']/string"), widget.get("name")
 
 
-def marked(module) -> list:
-    return list(module.ExpectedAppearancesLogic()._shown())
+def test_the_planning_panel_has_no_text_field_and_explains_what_is_chosen():
+    for widget in ui_root(MODULE).iter("widget"):
+        assert widget.get("class") not in ("QLineEdit", "QTextEdit", "QPlainTextEdit"), widget.get("name")
+        if widget.get("class") in ("QComboBox", "QSpinBox", "QDoubleSpinBox", "ctkSliderWidget", "qMRMLNodeComboBox"):
+            assert widget.findtext("property[@name='toolTip']/string"), widget.get("name")
 
 
-def count(class_name: str) -> int:
-    import slicer
-
-    return slicer.mrmlScene.GetNumberOfNodesByClass(class_name)
-
-
-def test_says_what_is_missing_before_a_frame_can_be_shown(module, tmp_path):
-    logic = module.ExpectedAppearancesLogic()
-    case, poses = module._writeTinyCase(tmp_path)
-    assert "Choose a case" in logic.problem("", "")
-    assert "case.json" in logic.problem(str(tmp_path), poses)
-    assert "Choose the poses.json" in logic.problem(case, "")
-    assert "absent.json" in logic.problem(case, str(tmp_path / "absent.json"))
-    assert logic.problem(case, poses) == ""
-    Path(poses).write_text("{", encoding="utf-8")  # read again, since it changed
-    assert "poses.json" in logic.problem(case, poses)
+def test_buttons_start_disabled_where_something_must_be_chosen_first():
+    enabled = {w.get("name"): w.findtext("property[@name='enabled']/bool") for w in ui_root(MODULE).iter("widget")}
+    for name in ("saveCaseButton", "renderButton", "appearancesStart", "trainingStart", "showFiguresButton"):
+        assert enabled[name] == "false", name
 
 
-def test_shows_the_frame_in_the_place_of_the_last(module, tmp_path):
-    logic = module.ExpectedAppearancesLogic()
-    case, poses = module._writeTinyCase(tmp_path)
-    assert logic.show(case, poses, 0), logic.message
-    nodes = len(marked(module))
-    assert count("vtkMRMLVectorVolumeNode") == count("vtkMRMLLinearTransformNode") == 1
-    assert count("vtkMRMLModelNode") == 3  # vessels, frustum, outline
-    assert logic.show(case, poses, 0)
-    assert len(marked(module)) == nodes
+OPEN_THE_PANEL = """
+import sys, types
+from unittest.mock import MagicMock
+
+class Stub(types.ModuleType):
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return MagicMock()
+
+slicer = sys.modules["slicer"] = Stub("slicer")
+for name in ("i18n", "util", "parameterNodeWrapper", "ScriptedLoadableModule"):
+    sys.modules["slicer." + name] = Stub("slicer." + name)
+sys.modules["slicer.i18n"].tr = lambda text: text
+sys.modules["slicer.parameterNodeWrapper"].parameterNodeWrapper = lambda cls: cls
+base = sys.modules["slicer.ScriptedLoadableModule"]
+for name in ("", "Logic", "Widget", "Test"):
+    members = {"__init__": lambda self, parent=None: None}
+    setattr(base, "ScriptedLoadableModule" + name, type("Base" + name, (), members))
+sys.modules["slicer.util"].VTKObservationMixin = type("Mixin", (), {})
+for name in ("qt", "ctk"):
+    sys.modules[name] = Stub(name)
+sys.path.insert(0, sys.argv[1])
+import ExpectedAppearances as module
+logic = module.ExpectedAppearancesLogic()
+from ExpectedAppearancesLib.widgets.planning_panel import PlanningPanel
+panel = PlanningPanel(MagicMock(), logic.session, MagicMock())
+heavy = ("torch", "cv2", "onnxruntime", "skimage", "scipy", "matplotlib")
+print([name for name in heavy if name in sys.modules], len(panel.sections))
+"""
 
 
-def test_hiding_all_leaves_only_the_users_own_nodes(module, tmp_path):
-    import slicer
-
-    own = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLModelNode", "Vessels")
-    nodes = slicer.mrmlScene.GetNumberOfNodes()
-    logic = module.ExpectedAppearancesLogic()
-    assert logic.show(*module._writeTinyCase(tmp_path), 0), logic.message
-    logic.hideAll()
-    assert slicer.mrmlScene.GetNumberOfNodes() == nodes
-    assert slicer.mrmlScene.IsNodePresent(own)
-    assert logic.message == ""
-
-
-@pytest.mark.parametrize("index", [1, 7])
-def test_nothing_old_stays_when_a_frame_is_refused(module, tmp_path, index):
-    logic = module.ExpectedAppearancesLogic()
-    case, poses = module._writeTinyCase(tmp_path)
-    assert logic.show(case, poses, 0), logic.message
-    assert not logic.show(case, poses, index)
-    assert str(index) in logic.message
-    assert count("vtkMRMLVectorVolumeNode") == count("vtkMRMLLinearTransformNode") == 0
-    assert count("vtkMRMLModelNode") == 1  # the vessels
-
-
-def test_a_frame_that_fails_leaves_no_half_of_it(module, tmp_path):
-    logic = module.ExpectedAppearancesLogic()
-    case, poses = module._writeTinyCase(tmp_path)
-    (tmp_path / "accepted.png").write_bytes(b"not a picture")
-    assert not logic.show(case, poses, 0)
-    assert "accepted.png" in logic.message
-    assert count("vtkMRMLLinearTransformNode") == 0
-
-
-def test_red_slice_lies_on_the_frame_upright(module, tmp_path):
-    import slicer
-
-    red = slicer.vtkMRMLSliceNode()
-    red.SetLayoutName("Red")
-    red.SetSingletonTag("Red")
-    red.SetDimensions(640, 480, 1)
-    composite = slicer.vtkMRMLSliceCompositeNode()
-    composite.SetSingletonTag("Red")
-    for node in (red, composite):
-        slicer.mrmlScene.AddNode(node)
-    logic = module.ExpectedAppearancesLogic()
-    assert logic.show(*module._writeTinyCase(tmp_path), 0), logic.message
-
-    slice_to_ras = np.array([[red.GetSliceToRAS().GetElement(i, j) for j in range(4)] for i in range(4)])
-    # The camera looks down world -z with world y up; LPS -> RAS turns x and y.
-    np.testing.assert_allclose(slice_to_ras[:3, 1], [0, -1, 0], atol=1e-9)
-    np.testing.assert_allclose(slice_to_ras[:3, 2], [0, 0, 1], atol=1e-9)
-    assert abs(slice_to_ras[2, 3]) < 15.0  # within the sphere around the origin
-    assert red.GetSliceVisible()
-    width_mm, height_mm, _depth_mm = red.GetFieldOfView()
-    assert width_mm / 640 == pytest.approx(height_mm / 480)
-    assert width_mm == pytest.approx((300 - slice_to_ras[2, 3]) * 64 / 90, rel=1e-3)
-    volume = slicer.mrmlScene.GetFirstNodeByClass("vtkMRMLVectorVolumeNode")
-    assert composite.GetBackgroundVolumeID() == volume.GetID()
+def test_opening_the_planning_panel_loads_nothing_heavy():
+    """In a fresh interpreter with stand-ins for Qt and Slicer: a fresh Slicer has none of these packages."""
+    done = subprocess.run(
+        [sys.executable, "-c", OPEN_THE_PANEL, str(FOLDER)], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert done.stdout.strip() == "[] 7", done.stdout + done.stderr

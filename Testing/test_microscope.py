@@ -123,3 +123,19 @@ def test_nonsense_is_refused():
         MicroscopeLook(jpeg_probability=1.5)
     with pytest.raises(ValueError, match="uint8"):
         apply(np.zeros((8, 8, 3), np.float32), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", ["sponge_probability", "retractor_probability"])
+def test_what_lies_on_the_cortex_covers_a_part_of_it_and_no_more(name):
+    image = np.full((96, 96, 3), (180, 90, 90), np.uint8)
+    covered = []
+    for seed in range(20):
+        result = apply(image, np.random.default_rng(seed), replace(NO_CHANGE, **{name: 1.0}))
+        covered.append((np.abs(result.astype(int) - image).max(axis=2) > 8).mean())
+    assert 0.01 < np.mean(covered) < 0.3 and max(covered) < 0.6 and np.std(covered) > 0.005
+
+
+def test_the_usual_look_is_mild_in_most_images_and_strong_in_some():
+    image = np.full((32, 32, 3), 120, np.uint8)
+    change = [np.abs(apply(image, np.random.default_rng(seed)).astype(int) - 120).mean() for seed in range(200)]
+    assert np.quantile(change, 0.25) < 25 and np.quantile(change, 0.95) > 45

@@ -15,6 +15,7 @@ from ExpectedAppearancesLib.registration.confidence import calibrate, calibratio
 from ExpectedAppearancesLib.registration.decoding import PlausibleView, cell_pixels, read_dense
 from ExpectedAppearancesLib.registration.pnp import fit_pose
 from ExpectedAppearancesLib.registration.predictor import Predictor, fitted_camera
+from ExpectedAppearancesLib.registration.refinement import VesselAligner
 
 CAMERA = Camera(128, 128, 240.0, 236.0, 66.0, 61.0)
 CENTRE = np.array([30.0, -60.0, 45.0])
@@ -125,12 +126,14 @@ def dense_output(true: np.ndarray, encoding: PoseEncoding, grid: int = 64) -> np
 def test_dense_output_is_read_in_the_right_pixels():
     true = pose(1)
     encoding = PoseEncoding(np.eye(3), CENTRE, 25.0, np.zeros(3), 1.0)
-    reading = read_dense(dense_output(true, encoding), CAMERA, encoding)
+    # No vessel is seen in this output, so nothing is refined.
+    aligner = VesselAligner(CENTRE + 5 * np.eye(3), np.array([[0, 1, 2]]), CAMERA)
+    reading = read_dense(dense_output(true, encoding), CAMERA, encoding, aligner)
     np.testing.assert_allclose(reading.camera_from_world, true, atol=2e-3)
     assert np.isfinite(reading.evidence).all()
     nothing = dense_output(true, encoding)
     nothing[4] = -6
-    assert read_dense(nothing, CAMERA, encoding).camera_from_world is None
+    assert read_dense(nothing, CAMERA, encoding, aligner).camera_from_world is None
 
 
 def test_confidence_is_calibrated_and_its_threshold_keeps_bad_poses_out():

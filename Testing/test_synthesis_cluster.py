@@ -11,10 +11,10 @@ import pytest
 from cases import texture, write_inputs
 
 from ExpectedAppearancesLib.appearances import store
-from ExpectedAppearancesLib.appearances.executors import check_executor
 from ExpectedAppearancesLib.appearances.stage import synthesize_case
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.errors import CancelledError, InputError
+from ExpectedAppearancesLib.executor import check_executor
 from ExpectedAppearancesLib.masks.stage import render_case
 
 distributed = pytest.importorskip("distributed")
@@ -119,6 +119,6 @@ def test_unknown_executors_are_refused(executor):
 
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("ExpectedAppearancesLib.appearances.executors.CONNECT_S", 1)
+    monkeypatch.setattr("ExpectedAppearancesLib.executor.CONNECT_S", 1)
     with pytest.raises(InputError, match=r"127\.0\.0\.1:9"):
         synthesize(make_case(tmp_path), "dask://127.0.0.1:9")

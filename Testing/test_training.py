@@ -8,7 +8,7 @@ import torch
 from cases import camera, write_inputs
 
 from ExpectedAppearancesLib import files
-from ExpectedAppearancesLib.appearances import store
+from ExpectedAppearancesLib.appearances import projection, store
 from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
@@ -18,6 +18,7 @@ from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.masks.stage import craniotomy_of, parenchyma_of, read_rendered, render_case
 from ExpectedAppearancesLib.model import views
 from ExpectedAppearancesLib.model.encoding import fit_encoding, network_camera
+from ExpectedAppearancesLib.model.feeder import Feeder, draw_views
 from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
 from ExpectedAppearancesLib.model.networks import build_network
 from ExpectedAppearancesLib.model.presets import PRESETS
@@ -62,6 +63,14 @@ def settings(method: str, **changes) -> views.ViewSettings:
     return replace(views.ViewSettings(method, 64, ("a", "b"), True, 0.0, 0.0, seed=5), **changes)
 
 
+def show_plainly(monkeypatch) -> None:
+    """Views without light, lens, or anything around the surface."""
+    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
+    monkeypatch.setattr(views, "opening", lambda *_: None)
+    monkeypatch.setattr(projection.SurfacePainter, "_lit", lambda _self, image, *_: image)
+    monkeypatch.setattr(projection, "DEPTH_OF_FIELD", 0.0)
+
+
 def agreement(view: views.View) -> float:
     """Intersection over union of the cells that look like vessels and those said to be."""
     cells = view.image.reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
@@ -72,8 +81,7 @@ def agreement(view: views.View) -> float:
 @pytest.mark.parametrize("method", ["surface", "image"])
 def test_views_show_at_each_cell_what_they_say(case, method, monkeypatch):
     """Points project onto their cells; colours and vessel cells agree, so image and geometry come from one pose."""
-    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
-    monkeypatch.setattr(views, "_lit", lambda image, *_: image)
+    show_plainly(monkeypatch)
     source = views.ViewSource(case.folder, settings(method))
     agreeing = []
     for index in range(6):
@@ -100,6 +108,17 @@ def test_views_depend_only_on_seed_and_index_and_have_poses_of_their_own(case):
     assert all(min(np.abs(paper.view(i).camera_from_world - p).max() for p in stored) < 1e-12 for i in range(5))
 
 
+def test_processes_that_draw_in_turn_draw_what_one_draws(case):
+    drawn = []
+    for workers in (1, 3):
+        with Feeder(case.folder, settings("surface"), 2, first_batch=1, workers=workers) as feeder:
+            drawn.append([feeder.next().images for _ in range(4)])
+    np.testing.assert_array_equal(*drawn)
+    source = views.ViewSource(case.folder, settings("surface"))
+    np.testing.assert_array_equal(drawn[0][1][1], source.view(5).image)
+    np.testing.assert_array_equal(draw_views(case.folder, settings("surface"), 18).images[17], source.view(17).image)
+
+
 def test_negative_views_have_no_surface(case):
     source = views.ViewSource(case.folder, settings("surface", negatives=1.0))
     drawn = [source.view(i) for i in range(8)]
@@ -108,8 +127,7 @@ def test_negative_views_have_no_surface(case):
 
 
 def test_elastic_deformation_takes_the_points_along(case, monkeypatch):
-    monkeypatch.setattr(views.microscope, "apply", lambda image, _rng: image)
-    monkeypatch.setattr(views, "_lit", lambda image, *_: image)
+    show_plainly(monkeypatch)
     straight = views.ViewSource(case.folder, settings("surface"))
     bent = views.ViewSource(case.folder, settings("surface", elastic_px=6.0))
     pairs = [(straight.view(i), bent.view(i)) for i in range(6)]
@@ -184,6 +202,7 @@ def test_trained_model_registers_frames_of_any_size_and_colour(trained, tmp_path
     frame = json.loads(out.read_text())["frames"][0]
     assert frame["image"] == "ä b.png" and frame["accepted"] is False
     assert {"confidence", "rotation_vector_rad", "translation_mm", "latency_ms", "camera_from_world"} <= frame.keys()
+    assert meta["covariance"].keys() == {"shared", "scale"} and "covariance" in frame
 
 
 def test_every_bad_frame_is_listed_and_nothing_is_written(trained, tmp_path, capsys):

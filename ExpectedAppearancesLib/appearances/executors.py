@@ -3,34 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import time
 from collections.abc import Callable
 
-from ..errors import ExpectedAppearancesError, InputError
+from ..errors import ExpectedAppearancesError
+from ..executor import LOCAL, check_executor, connect
 from .claims import ClaimLost
 from .shards import Recipe, Shard, work_on
 
-LOCAL = "local"
-_ADDRESS = re.compile(r"dask://(?P<host>\[[0-9a-fA-F:]+\]|[^/:\s]+):(?P<port>\d{1,5})/?")
 POLL_S = 1.0
-CONNECT_S = 15
 
-OnProgress = Callable[[float, str], None]  # images done (with fractions), name of the shard
-
-
-def check_executor(executor: str) -> None:
-    """Raises InputError for anything but `local` and `dask://HOST:PORT`, or where dask is missing."""
-    if executor == LOCAL:
-        return
-    if not _ADDRESS.fullmatch(executor):
-        raise InputError(f"--executor: '{executor}' is not known; give local or dask://HOST:PORT of a dask scheduler.")
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "--executor: dask.distributed is not installed; run: pip install 'expected-appearances[cluster]'"
-        ) from None
+OnProgress = Callable[[float, str], None]  # images done (with fractions), what is made
 
 
 def run_shards(shards: list[Shard], recipe: Recipe, executor: str, on_progress: OnProgress) -> None:
@@ -49,9 +32,10 @@ def _run_here(shards: list[Shard], recipe: Recipe, on_progress: OnProgress) -> N
         for shard in waiting:
             missing = len(shard.items) - len(shard.finished())
             before = done + len(shard.items) - missing
-            on_progress(before, shard.name)
+            name = f"texture {shard.texture.name}"
+            on_progress(before, name)
             try:
-                made = work_on(shard, recipe, lambda n, shard=shard, before=before: on_progress(before + n, shard.name))
+                made = work_on(shard, recipe, lambda n, name=name, before=before: on_progress(before + n, name))
             except ClaimLost:
                 made = None
             if made is None:
@@ -59,22 +43,15 @@ def _run_here(shards: list[Shard], recipe: Recipe, on_progress: OnProgress) -> N
             else:
                 done += len(shard.items)
         if held:
-            on_progress(done, held[0].name)
+            on_progress(done, f"texture {held[0].texture.name}")
             time.sleep(POLL_S)
         waiting = held
 
 
 def _run_on_dask(shards: list[Shard], recipe: Recipe, executor: str, on_progress: OnProgress) -> None:
-    from distributed import Client, TimeoutError, wait
+    from distributed import TimeoutError, wait
 
-    address = "tcp://" + executor.removeprefix("dask://").rstrip("/")
-    try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, TimeoutError) as error:
-        raise InputError(
-            f"--executor: no dask scheduler answers at {address} ({error}); start one with `dask scheduler`, "
-            "or leave --executor out."
-        ) from error
+    client = connect(executor)
     waiting, running, done = list(shards), {}, 0
     try:
         while waiting or running:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,12 +13,13 @@ from .. import files
 from ..case.case import Case
 from ..devices import choose_device
 from ..errors import InputError
+from ..executor import LOCAL, check_executor
 from ..geometry.camera import Camera
 from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, read_rendered
 from ..textures.library import Texture
 from . import store
-from .executors import LOCAL, check_executor, run_shards
+from .executors import run_shards
 from .overview import overview_view
 from .shards import Recipe, make_shards
 from .vgg import SHIPPED_WEIGHTS, load_vgg
@@ -63,6 +65,9 @@ def synthesize_case(
         "circular_field": case.manifest["stages"].get("render", {}).get("circular_field"),
     }
     folder = store.folder_of(case, method)
+    digests = [texture.sha256 for texture in textures]
+    for item in planned:
+        item["texture_sha256"] = digests[item["texture"]]  # by which a panel sees that a texture has changed
     files.require_space(case.folder, len(planned) * size_px**2 * 2.5e-6 + 5)
     shards = make_shards(folder, planned, textures, settings)
     case.record("synthesize", method=method, styles=sorted({t.name for t in textures}), images=len(planned), done=False)
@@ -70,29 +75,51 @@ def synthesize_case(
     recipe = Recipe(
         iterations, str(weights_file) if weights_path else None, settings["weights_sha256"], device.type, batch
     )
-    run_shards(
-        shards,
-        recipe,
-        executor,
-        lambda images, name: progress(
-            min(1.0, images / len(planned)),
-            f"appearance {min(int(images) + 1, len(planned))} of {len(planned)}, {name}",
-        ),
-    )
-    made = {}
-    for shard in shards:
-        made.update(shard.finished())
-    figures = ("gram_distance", "gram_distance_by_class")
-    items = [
-        {name: value for name, value in item.items() if name != "texture"}
-        | {name: made[item["image"]][name] for name in figures}
-        for item in planned
-    ]
-    store.write_index(case, method, camera, settings, items, done=True)
+    index = _GrowingIndex(case, method, camera, settings, planned, shards)
+
+    def report(images: float, name: str) -> None:
+        index.refresh(images)
+        text = f"appearance {min(int(images) + 1, len(planned))} of {len(planned)}, {name}"
+        progress(min(1.0, images / len(planned)), text)
+
+    run_shards(shards, recipe, executor, report)
+    items = index.write(done=True)
     by_class = mean_distances(items)
     total = round(sum(by_class.values()), 4)
     case.record("synthesize", done=True, **settings, gram_distance_mean=total, gram_distance_by_class=by_class)
     return by_class
+
+
+class _GrowingIndex:
+    """The index of what is finished so far, for those who watch; at the end, of all."""
+
+    def __init__(self, case: Case, method: str, camera: Camera, settings: dict, planned: list[dict], shards: list):
+        self._content = case, method, camera, settings
+        self._planned, self._shards = planned, shards
+        self._images, self._next_s = 0, 0.0
+
+    def refresh(self, images: float) -> None:
+        """Write it where images came, but so that writing never takes more than a few hundredths of the time."""
+        if int(images) == self._images or time.monotonic() < self._next_s:
+            return
+        self._images, begin = int(images), time.monotonic()
+        self.write(done=False)
+        now = time.monotonic()
+        self._next_s = now + max(1.0, 50 * (now - begin))
+
+    def write(self, done: bool) -> list[dict]:
+        made = {}
+        for shard in self._shards:
+            made.update(shard.finished())
+        figures = ("gram_distance", "gram_distance_by_class")
+        items = [
+            {name: value for name, value in item.items() if name != "texture"}
+            | {name: made[item["image"]][name] for name in figures}
+            for item in self._planned
+            if done or item["image"] in made
+        ]
+        store.write_index(*self._content, items, done=done)
+        return items
 
 
 def mean_distances(items: list[dict]) -> dict[str, float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -20,10 +20,10 @@ Range = tuple[float, float]
 class MicroscopeLook:
     """Ranges that each image draws from uniformly; names that end in _probability are shares of images."""
 
-    exposure_stops: Range = (-0.9, 0.7)
-    contrast: Range = (0.65, 1.45)
-    white_balance: Range = (0.75, 1.3)  # gain of each channel
-    hue_deg: Range = (-25.0, 25.0)
+    exposure_stops: Range = (-1.5, 1.2)
+    contrast: Range = (0.6, 1.5)
+    white_balance: Range = (0.7, 1.35)  # gain of each channel
+    hue_deg: Range = (-22.0, 22.0)
     saturation: Range = (0.3, 1.6)
     gamma: Range = (0.6, 1.6)
     light_gradient: Range = (0.0, 0.35)  # slow unevenness of the light
@@ -36,8 +36,10 @@ class MicroscopeLook:
     specular_probability: float = 0.6
     fine_vessels: Range = (1.0, 8.0)  # number of thin arteries that the mesh does not have
     fine_vessels_probability: float = 0.4
-    blood_probability: float = 0.08
+    blood_probability: float = 0.1
+    sponge_probability: float = 0.06
     instrument_probability: float = 0.06
+    retractor_probability: float = 0.05
     circular_field: Range = (0.36, 0.6)  # radius
     circular_field_probability: float = 0.15
     jpeg_quality: Range = (35.0, 95.0)
@@ -66,7 +68,9 @@ NO_CHANGE = MicroscopeLook(
     specular_probability=0.0,
     fine_vessels_probability=0.0,
     blood_probability=0.0,
+    sponge_probability=0.0,
     instrument_probability=0.0,
+    retractor_probability=0.0,
     circular_field_probability=0.0,
     jpeg_probability=0.0,
 )
@@ -74,12 +78,13 @@ NO_CHANGE = MicroscopeLook(
 
 def apply(image: np.ndarray, rng: np.random.Generator, look: MicroscopeLook | None = None) -> np.ndarray:
     """uint8 RGB (H, W, 3) -> uint8 RGB (H, W, 3), the input unchanged. The same generator state gives the same image.
+    Without a `look`, the default one at a strength that is drawn too.
 
     In the order of the light: scene (arteries, blood, instruments, reflections), illumination, optics, sensor, file.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image {image.shape} {image.dtype} is not uint8 RGB")
-    look = look or DEFAULT
+    look = look or _toned_down(DEFAULT, rng.uniform(0.15, 1.0))
     scene = image.copy()
     if rng.random() < look.fine_vessels_probability:
         _draw_fine_vessels(scene, rng, look)
@@ -87,8 +92,12 @@ def apply(image: np.ndarray, rng: np.random.Generator, look: MicroscopeLook | No
     scene = _colour(scene, rng, look)
     if rng.random() < look.blood_probability:
         scene = _draw_blood(scene, rng)
+    if rng.random() < look.sponge_probability:
+        scene = _draw_sponge(scene, rng)
     if rng.random() < look.instrument_probability:
         scene = _draw_instrument(scene, rng)
+    if rng.random() < look.retractor_probability:
+        scene = _draw_retractor(scene, rng)
     light = _light(scene.shape[:2], rng, look)
     if rng.random() < look.specular_probability:
         scene = _draw_specular_spots(scene, rng, look)
@@ -100,6 +109,21 @@ def apply(image: np.ndarray, rng: np.random.Generator, look: MicroscopeLook | No
         quality = int(rng.uniform(*look.jpeg_quality))
         result = cv2.imdecode(cv2.imencode(".jpg", result, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
     return result
+
+
+# Lengths and amounts whose neutral value is not NO_CHANGE's, or which a mild look may have in full.
+_NOT_TONED = {"motion", "specular_spots", "fine_vessels", "circular_field", "jpeg_quality"}
+
+
+def _toned_down(look: MicroscopeLook, strength: float) -> MicroscopeLook:
+    """Every range drawn together towards no change: most frames are mild in all ways at once, few in none."""
+    changed = {}
+    for field in fields(look):
+        if not field.name.endswith("_probability") and field.name not in _NOT_TONED:
+            neutral = getattr(NO_CHANGE, field.name)[0]
+            low, high = getattr(look, field.name)
+            changed[field.name] = (neutral + (low - neutral) * strength, neutral + (high - neutral) * strength)
+    return replace(look, **changed)
 
 
 def _colour(image: np.ndarray, rng: np.random.Generator, look: MicroscopeLook) -> np.ndarray:
@@ -216,6 +240,37 @@ def _draw_instrument(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         cv2.line(mask, *ends, 255, max(1, round(thickness * scale)), cv2.LINE_AA)
         image = _blend(image, mask, np.full(3, shade), 1.0, 0.0)
     return image
+
+
+def _draw_sponge(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A cotton patch: a pale woven rectangle, often stained."""
+    height, width = image.shape[:2]
+    short_side = min(height, width)
+    sides = rng.uniform(0.08, 0.3, 2) * short_side
+    centre = rng.uniform(0.1, 0.9, 2) * (width, height)
+    corners = cv2.boxPoints((centre.tolist(), sides.tolist(), rng.uniform(0, 180)))
+    mask = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(mask, [np.rint(corners * 16).astype(np.int32)], 255, cv2.LINE_AA, shift=4)
+    stain = rng.uniform(0, 0.6)
+    colour = (1 - stain) * rng.uniform(180, 250) + stain * rng.uniform((120, 20, 20), (200, 90, 80))
+    patch = np.empty_like(image)
+    patch[:] = colour.astype(np.uint8)
+    patch = cv2.add(patch, _noise(patch.shape, rng) * np.float32(rng.uniform(4, 25)), dtype=cv2.CV_8U)
+    cv2.copyTo(cv2.GaussianBlur(patch, (0, 0), 0.7), mask, image)
+    return image
+
+
+def _draw_retractor(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A broad blade from the border, of metal or in shadow, with a rounded end."""
+    height, width = image.shape[:2]
+    short_side, angle = min(height, width), rng.uniform(0, 2 * math.pi)
+    direction = np.array([math.cos(angle), math.sin(angle)])
+    tip = np.array([width, height]) / 2 + direction * rng.uniform(0.25, 0.5) * short_side
+    far = tip + direction * (height + width)
+    mask = np.zeros((height, width), np.uint8)
+    ends = [np.rint(end).astype(int).tolist() for end in (tip, far)]
+    cv2.line(mask, *ends, 255, round(rng.uniform(0.15, 0.35) * short_side), cv2.LINE_AA)
+    return _blend(image, mask, np.full(3, rng.uniform(30, 200)) + rng.uniform(-10, 10, 3), 1.0, 0.006 * short_side)
 
 
 def _draw_specular_spots(image: np.ndarray, rng: np.random.Generator, look: MicroscopeLook) -> np.ndarray:

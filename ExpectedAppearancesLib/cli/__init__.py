@@ -10,6 +10,7 @@ import logging
 import signal
 import sys
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from .. import __version__
 from ..errors import (
@@ -22,6 +23,9 @@ from ..errors import (
     InputError,
 )
 
+if TYPE_CHECKING:
+    from .progress import Progress
+
 # name -> (module, help). Modules are imported only when their command is chosen: torch and VTK take seconds.
 COMMANDS = {
     "demo": (".demo", "run the whole pipeline on a small generated case"),
@@ -31,14 +35,18 @@ COMMANDS = {
     "train": (".train", "train the pose network on the expected appearances"),
     "register": (".register", "find the pose of microscope frames"),
     "evaluate": (".evaluate", "measure predicted poses against known ones"),
+    "study": (".study", "leave-one-texture-out, number of textures, rivals and robustness, in one report"),
     "check": (".check", "report versions, devices, memory, rendering and weights, for a support request"),
 }
 # Errors of the system that mean: choose another folder or make room.
 UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0 done, 2 bad input, 3 cancelled, 1 anything else."""
+def main(argv: Sequence[str] | None = None, progress: Progress | None = None) -> int:
+    """Run one command; returns the exit code: 0 done, 2 bad input, 3 cancelled, 1 anything else.
+
+    progress: how progress is reported; lines on stderr if None.
+    """
     argv = list(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that cannot show a character of a path must not end the run.
@@ -55,12 +63,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     from .logs import log_file
     from .progress import Progress
 
-    progress = Progress()
+    progress = progress or Progress()
     # `new` must leave a case that it refuses to replace as it was.
     case_folder = None if args.command == "new" else getattr(args, "case", None)
     with log_file(args.command, case_folder) as log_path:
         try:
-            with _termination_cancels():
+            with termination_cancels():
                 code = args.run(args, progress)
             progress.finish()
             code = EXIT_DONE if code is None else int(code)
@@ -70,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = EXIT_CANCELLED
         except InputError as error:
             logging.exception("bad input")
-            _say_problems(args.command, error.problems)
+            say_problems(args.command, error.problems)
             code = EXIT_BAD_INPUT
         except OSError as error:
             logging.exception("system error")
@@ -103,7 +111,7 @@ def _build_parser(argv: list[str]) -> argparse.ArgumentParser:
 
 
 @contextlib.contextmanager
-def _termination_cancels() -> Iterator[None]:
+def termination_cancels() -> Iterator[None]:
     """Within the block, SIGTERM (and Ctrl+Break on Windows) raises CancelledError."""
 
     def cancel(_number, _frame):
@@ -126,7 +134,7 @@ def _report_system_error(command: str, error: OSError, log_path) -> int:
         _report_failure(error, log_path)
         return EXIT_FAILED
     name = error.filename or "a file"
-    _say_problems(command, [f"{name}: {error.strerror}; free some space or choose a folder you may use."])
+    say_problems(command, [f"{name}: {error.strerror}; free some space or choose a folder you may use."])
     return EXIT_BAD_INPUT
 
 
@@ -147,7 +155,7 @@ def _missing_package(error: ImportError) -> str:
     return f"the Python package '{name}' is not installed; install it with pip (`check` lists what is missing)."
 
 
-def _say_problems(command: str, problems: list[str]) -> None:
+def say_problems(command: str, problems: list[str]) -> None:
     count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
     _say("\n".join([f"{command}: {count} with the input", *(f"  - {problem}" for problem in problems)]))
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import platform
 import shutil
 import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
 from .. import __version__
+from ..runs.environment import python_for_runs
 
 DESCRIPTION = """\
 Report the versions of Python and of the packages, the devices with their memory, the CPU's features, memory, disk,
@@ -29,10 +30,13 @@ PACKAGES = (
     (("safetensors",), "synthesize and train"),
     (("onnx",), "train"),
     (("scipy",), "demo"),
+    (("psutil",), "runs started from 3D Slicer"),
+    (("filelock",), "runs started from 3D Slicer"),
     (("matplotlib",), "evaluate"),
     (("jinja2",), "evaluate and demo"),
     (("slicer-core",), ""),
 )
+BUILT_IN = ("vtk",)  # 3D Slicer's own build is no distribution that pip knows
 CPU_FEATURES = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_tile", "amx_bf16", "amx_int8")
 WEIGHTS_FOLDER = Path(__file__).parents[1] / "appearances" / "weights"
 RENDERING_PACKAGES = "libegl1 libgl1-mesa-dri libosmesa6"
@@ -75,7 +79,7 @@ def run(args, _progress) -> int:
     if args.json:
         print(json.dumps(report, indent=1))
     else:
-        print("\n".join(_lines(report)))
+        print("\n".join(report_lines(report)))
     return 1 if report["problems"] else 0
 
 
@@ -96,7 +100,7 @@ def make_report() -> dict:
     return {
         "expected_appearances": __version__,
         "python": platform.python_version(),
-        "executable": sys.executable,
+        "executable": python_for_runs(),
         "system": platform.platform(),
         "packages": packages,
         "cpu": _cpu(),
@@ -118,6 +122,8 @@ def _packages() -> tuple[dict[str, str | None], list[str]]:
                 found[name] = metadata.version(name)
             except metadata.PackageNotFoundError:
                 continue
+        if not found and names[0] in BUILT_IN and importlib.util.find_spec(names[0]):
+            found = {names[0]: "built into this program"}
         versions.update(found or {names[0]: None})
         if needed_by and not found:
             problems.append(f"{names[0]} is not installed, {needed_by} cannot work; run: pip install {names[0]}")
@@ -143,7 +149,7 @@ def _devices() -> list[dict]:
 def _run_python(source: str) -> tuple[int, str, str]:
     try:
         done = subprocess.run(
-            [sys.executable, "-c", source],
+            [python_for_runs(), "-c", source],
             capture_output=True,
             text=True,
             errors="replace",
@@ -181,7 +187,7 @@ def _memory_gb() -> float | None:
     return None
 
 
-def _lines(report: dict) -> list[str]:
+def report_lines(report: dict) -> list[str]:
     cpu, rendering = report["cpu"], report["rendering"]
     features = "unknown" if cpu["features"] is None else " ".join(cpu["features"]) or "none of note"
     lines = [

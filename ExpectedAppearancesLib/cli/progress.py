@@ -15,8 +15,9 @@ class Progress:
     def __init__(self, stream=None, clock=time.monotonic):
         self._stream = stream
         self._clock = clock
-        self._printed_s = -INTERVAL_S
-        self._held_back: str | None = None
+        self._created_s = clock()
+        self._printed_s: float | None = None
+        self._held_back: tuple[float, str, float | None] | None = None
         self._begin: tuple[float, float] | None = None  # time and fraction that the rate is measured from
 
     def __call__(self, fraction: float, message: str) -> None:
@@ -24,26 +25,37 @@ class Progress:
         now_s = self._clock()
         if self._begin is None or fraction < self._begin[1]:
             self._begin = (now_s, fraction)  # a resumed run begins beyond 0, a new stage falls back
-        line = f"{100 * fraction:3.0f} %  {message}{self._time_left(now_s, fraction)}"
-        if now_s - self._printed_s >= INTERVAL_S or fraction == 1.0:
-            self._print(line, now_s)
+        report = fraction, message, self._seconds_left(now_s, fraction)
+        interval_s = self._interval_s(now_s - self._created_s)
+        if self._printed_s is None or now_s - self._printed_s >= interval_s or fraction == 1.0:
+            self._print(report, now_s)
         else:
-            self._held_back = line
+            self._held_back = report
 
     def finish(self) -> None:
         if self._held_back is not None:
             self._print(self._held_back, self._clock())
 
-    def _time_left(self, now_s: float, fraction: float) -> str:
+    def _interval_s(self, _elapsed_s: float) -> float:
+        return INTERVAL_S
+
+    def _seconds_left(self, now_s: float, fraction: float) -> float | None:
         begin_s, begin_fraction = self._begin
         if fraction >= 1.0 or fraction <= begin_fraction or now_s - begin_s < 1.0:
-            return ""
-        return f" ({duration((now_s - begin_s) * (1.0 - fraction) / (fraction - begin_fraction))} left)"
+            return None
+        return (now_s - begin_s) * (1.0 - fraction) / (fraction - begin_fraction)
 
-    def _print(self, line: str, now_s: float) -> None:
+    def _print(self, report: tuple[float, str, float | None], now_s: float) -> None:
         self._printed_s, self._held_back = now_s, None
-        logging.getLogger("progress").info(line.strip())
-        print(line, file=self._stream or sys.stderr, flush=True)
+        logging.getLogger("progress").info(self._line(*report).strip())
+        self._show(*report)
+
+    def _line(self, fraction: float, message: str, seconds_left: float | None) -> str:
+        left = "" if seconds_left is None else f" ({duration(seconds_left)} left)"
+        return f"{100 * fraction:3.0f} %  {message}{left}"
+
+    def _show(self, fraction: float, message: str, seconds_left: float | None) -> None:
+        print(self._line(fraction, message, seconds_left), file=self._stream or sys.stderr, flush=True)
 
 
 def duration(seconds: float) -> str:

@@ -10,26 +10,36 @@ def add_parser(subparsers) -> None:
         "register",
         help="find the pose of microscope frames",
         description="Finds the pose of each frame with the case's trained model and writes poses.json. A frame whose "
-        "pose cannot be trusted is refused (accepted: false). Images may be PNG, JPEG or TIFF of any size.",
+        "pose cannot be trusted is refused (accepted: false). Images may be PNG, JPEG or TIFF of any size; a video is "
+        "given in their place, alone.",
     )
     parser.add_argument("case", metavar="CASE", help="case folder")
-    parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE", help="microscope frames")
+    parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE", help="microscope frames, or one video")
     parser.add_argument("--out", type=Path, required=True, metavar="poses.json", help="file to write")
     parser.add_argument("--camera", type=Path, metavar="FILE", help="camera of the frames, if not the case's")
+    parser.add_argument(
+        "--track",
+        action="store_true",
+        help="also filter the poses over time (images in the order of time): tracked_camera_from_world and tracking",
+    )
+    parser.add_argument(
+        "--fps", type=float, metavar="HZ", help="frames per second, of images or where a video's own are wrong"
+    )
     parser.set_defaults(run=run)
 
 
 def run(args, progress) -> None:
-    from .. import files
     from ..case.case import Case
     from ..errors import InputError, Problems
     from ..geometry.camera import read_camera
+    from ..registration.footage import Footage
     from ..registration.poses_file import write_poses
     from ..registration.predictor import Predictor
-    from ..registration.record import frame_record
+    from ..registration.record import frame_record, tracking_record
+    from ..registration.tracking import Tracker, TrackerSettings, TrackState
 
     problems = Problems()
-    case = camera = predictor = None
+    case = camera = predictor = footage = None
     with problems.collect():
         case = Case.open(args.case)
     with problems.collect():
@@ -37,21 +47,39 @@ def run(args, progress) -> None:
     if case:
         with problems.collect():
             predictor = Predictor(case.model_folder)
-    for path in args.images:
-        if not path.is_file():
-            problems.add(f"{path}: image not found; check the path.")
+    with problems.collect():
+        footage = Footage(args.images, args.fps)
+    if footage and args.track and not footage.is_video and args.fps is None:
+        problems.add("--track: images carry no time; give their frames per second with --fps.")
+    if predictor and args.track and not predictor.gives_covariance:
+        problems.add(f"{case.model_folder}: this model tells no covariance, which --track needs; run `train` again.")
     problems.raise_if_any()
     camera = camera or case.camera
+    tracker = Tracker(TrackerSettings(predictor.encoding.centre_world_mm)) if args.track else None
     frames = []
-    for i, path in enumerate(args.images):
+    for i, frame in enumerate(footage):
+        record = None
         with problems.collect():
-            image = files.read_image_rgb(path)
+            image = frame.read_rgb()
             try:
-                frames.append(frame_record(path, predictor.predict(image, camera)))
+                prediction = predictor.predict(image, camera)
             except InputError as error:
-                problems.add(f"{path}: {error}")
-        progress((i + 1) / len(args.images), f"frame {i + 1} of {len(args.images)}")
+                raise InputError(f"{frame.image}: {error}") from error
+            record = frame_record(frame.image, prediction)
+        if record:
+            if frame.time_s is not None:
+                record["time_s"] = round(frame.time_s, 6)
+            if tracker:
+                record |= tracking_record(tracker.update(frame.time_s, prediction))
+            frames.append(record)
+        elif footage.is_video:
+            break  # every other frame has the same size
+        total = max(footage.count, i + 1)
+        progress((i + 1) / total, f"frame {i + 1} of {total}")
     problems.raise_if_any()
     write_poses(args.out, camera, frames)
     accepted = sum(frame["accepted"] for frame in frames)
     print(f"{accepted} of {len(frames)} frames accepted. Poses: {args.out}")
+    if tracker:
+        lost = sum(frame["tracking"]["state"] == TrackState.LOST for frame in frames)
+        print(f"{len(frames) - lost} of {len(frames)} frames have a tracked pose.")

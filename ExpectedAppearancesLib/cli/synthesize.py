@@ -39,7 +39,7 @@ def add_parser(subparsers) -> None:
     parser.add_argument("--size", type=int, help="height of the images, px; left out: 384 (surface) or 256 (image)")
     parser.add_argument("--seeds", type=int, default=1, help="surface: appearances per texture")
     parser.add_argument("--iterations", type=int, default=40, help="L-BFGS iterations, most of them at half the size")
-    parser.add_argument("--batch", type=_batch, default="auto", help="images optimised together, or auto")
+    parser.add_argument("--batch", type=int, help="images optimised together; left out: as many as memory allows")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     parser.add_argument(
         "--executor",
@@ -47,10 +47,6 @@ def add_parser(subparsers) -> None:
         help="local, or dask://HOST:PORT of a dask scheduler whose workers reach CASE under the same path",
     )
     parser.set_defaults(run=run)
-
-
-def _batch(text: str) -> int | None:
-    return None if text == "auto" else int(text)
 
 
 def run(args, progress) -> None:
@@ -69,7 +65,7 @@ def run(args, progress) -> None:
         if value is not None and value < least:
             problems.add(f"--{name}: {value}; give at least {least}.")
     if args.executor != "local":
-        from ..appearances.executors import check_executor
+        from ..executor import check_executor
 
         with problems.collect():
             check_executor(args.executor)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 
 def add_parser(subparsers) -> None:
@@ -16,9 +17,10 @@ def add_parser(subparsers) -> None:
     parser.add_argument("case", metavar="CASE", help="case folder")
     parser.add_argument(
         "--preset",
-        choices=("quick", "best", "paper"),
+        choices=("quick", "best", "paper", "probseg", "binseg"),
         default="quick",
-        help="quick: for a CPU; best: larger and longer, for a GPU; paper: the paper's network, loss and schedule",
+        help="quick: for a CPU; best: larger and longer, for a GPU; paper: the paper's network, loss and schedule; "
+        "probseg, binseg: its rivals, which segment the vessels first",
     )
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     parser.add_argument("--seed", type=int, default=0, help="seed of weights and views")
@@ -28,6 +30,20 @@ def add_parser(subparsers) -> None:
         "--appearances",
         choices=("surface", "image"),
         help="method whose appearances are used; left out: the one that is complete",
+    )
+    study = parser.add_argument_group("models for a study (the case's own model stays as it is)")
+    study.add_argument("--model-folder", type=Path, metavar="DIR", help="folder of such a model")
+    study.add_argument("--exclude", nargs="+", default=[], metavar="STYLE", help="textures to leave out")
+    study.add_argument(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="poses.json whose poses training repeats, as the paper's leave-one-texture-out does; left out: fresh ones",
+    )
+    study.add_argument(
+        "--no-inner-texture",
+        action="store_true",
+        help="train on every texture that is not left out, and choose the epoch on other poses alone",
     )
     parser.set_defaults(run=run)
 
@@ -50,17 +66,23 @@ def run(args, progress) -> None:
         value = getattr(args, name)
         if value is not None and value <= 0:
             problems.add(f"--{name}: {value}; it must be above 0.")
+    if args.model_folder is None and (args.exclude or args.poses or args.no_inner_texture):
+        problems.add("--model-folder: missing; --exclude, --poses and --no-inner-texture make no model for use.")
     problems.raise_if_any()
 
     from ..devices import choose_device
+    from ..model.fold import Fold
     from ..model.presets import PRESETS
     from ..model.training import train_case
 
     given = {name: getattr(args, name) for name in ("minutes", "steps") if getattr(args, name) is not None}
     preset = replace(PRESETS[args.preset], **given)
-    figures = train_case(case, preset, progress, choose_device(args.device), args.seed, args.appearances)
+    fold = None
+    if args.model_folder:
+        fold = Fold(args.model_folder.absolute(), tuple(args.exclude), args.poses, not args.no_inner_texture)
+    figures = train_case(case, preset, progress, choose_device(args.device), args.seed, args.appearances, fold)
     print(
         f"Validation on unseen synthetic views: ADD {figures['add_mm_mean']:.2f} mm mean, "
         f"{figures['add_mm_median']:.2f} mm median, {100 * figures['add_below_3mm']:.1f} % below 3 mm."
     )
-    print(f"Model: {case.model_folder / 'model.onnx'}")
+    print(f"Model: {(args.model_folder or case.model_folder) / 'model.onnx'}")

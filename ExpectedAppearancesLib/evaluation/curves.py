@@ -14,9 +14,9 @@ from .metrics import ADD_RANGE_MM, FrameErrors, accuracy, add_accuracy, add_auc
 _ALL, _ACCEPTED, _STYLE, _SECOND = "#1f4e99", "#2a9d5c", "#9aa5b1", "#e08a2e"
 
 
-def curve_points(errors: FrameErrors) -> dict[str, list[float]]:
-    """Shares at the limits n = 0, 1 ... 20: 'limits', 'n mm-n deg' and 'add'."""
-    limits = np.arange(0, int(ADD_RANGE_MM) + 1)
+def curve_points(errors: FrameErrors, step: float = 1) -> dict[str, list[float]]:
+    """Shares at the limits n = 0, step ... 20: 'limits', 'n mm-n deg' and 'add'."""
+    limits = np.arange(round(ADD_RANGE_MM / step) + 1) * step
     return {
         "limits": limits.tolist(),
         "n mm-n deg": [accuracy(errors, n) for n in limits],
@@ -26,7 +26,7 @@ def curve_points(errors: FrameErrors) -> dict[str, list[float]]:
 
 def write_curves(path: Path, errors: FrameErrors, styles: Sequence[str | None]) -> None:
     """Two panels: share within n mm and n degrees, and share with ADD below n mm; thin lines are the styles."""
-    figure = _figure(10, 4.4)
+    figure = new_figure(10, 4.4)
     limits = np.linspace(0, ADD_RANGE_MM, 201)
     labels = np.array([style or "" for style in styles], object)
     panels = (
@@ -50,13 +50,13 @@ def write_curves(path: Path, errors: FrameErrors, styles: Sequence[str | None]) 
         axes.legend(loc="lower right", frameon=False)
     figure.axes[0].set_ylabel("share of frames, %")
     figure.axes[1].text(0.97, 0.35, f"AUC {add_auc(errors):.3f}", transform=figure.axes[1].transAxes, ha="right")
-    _write(path, figure)
+    write_figure(path, figure)
 
 
 def write_style_bars(path: Path, metrics: dict) -> None:
     """Bars for each style of `metrics.metrics`: ADD mean and median, and the share within 3 mm-3 deg and 5 mm-5 deg."""
     styles = metrics["styles"]
-    figure = _figure(10, 1.6 + 0.34 * len(styles))
+    figure = new_figure(10, 1.6 + 0.34 * len(styles))
     left, right = figure.subplots(1, 2, sharey=True)
     rows = np.arange(len(styles))
     panels = (
@@ -74,14 +74,14 @@ def write_style_bars(path: Path, metrics: dict) -> None:
     left.set_yticks(rows, list(styles))
     left.set_ylabel("style")
     left.invert_yaxis()
-    _write(path, figure)
+    write_figure(path, figure)
 
 
 def _accuracy_bars(metrics: dict) -> list[tuple[str, str]]:
     return list(zip(metrics["accuracy"], (_ALL, _SECOND)))
 
 
-def _figure(width_inch: float, height_inch: float):
+def new_figure(width_inch: float, height_inch: float):
     # The object interface: pyplot keeps global state and may want a display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -91,7 +91,7 @@ def _figure(width_inch: float, height_inch: float):
     return figure
 
 
-def _write(path: Path, figure) -> None:
+def write_figure(path: Path, figure) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     files.write_bytes(path, buffer.getvalue())

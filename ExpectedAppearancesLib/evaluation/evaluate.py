@@ -57,9 +57,9 @@ def evaluate(
     problems = Problems()
     camera, true, predicted = case.camera, [], None
     with problems.collect():
-        _check_out(out_folder)
+        check_out(out_folder)
     with problems.collect():
-        camera, true = _known_frames(Path(poses_path), styles, case.camera)
+        camera, true = known_frames(Path(poses_path), styles, case.camera)
     if predicted_path is not None:
         with problems.collect():
             predicted = _pair(true, Path(predicted_path))
@@ -71,7 +71,7 @@ def evaluate(
     problems.raise_if_any()
 
     if predicted is None:
-        predicted = _register(true, camera, predictor, progress)
+        predicted = register_frames(true, camera, predictor, progress)
     evaluation = compare(case, camera, true, predicted)
     _write(case, evaluation, out_folder, progress)
     return evaluation
@@ -93,7 +93,7 @@ def compare(case: Case, camera: Camera, true: list[Frame], predicted: list[Frame
     return Evaluation(camera, true, predicted, errors, result)
 
 
-def _check_out(folder: Path) -> None:
+def check_out(folder: Path) -> None:
     """Raise InputError when `folder` cannot be made or written; makes nothing."""
     existing = folder
     while not existing.exists():
@@ -105,7 +105,7 @@ def _check_out(folder: Path) -> None:
     files.require_space(folder, NEEDED_MB)
 
 
-def _known_frames(path: Path, styles: Sequence[str] | None, case_camera: Camera) -> tuple[Camera, list[Frame]]:
+def known_frames(path: Path, styles: Sequence[str] | None, case_camera: Camera) -> tuple[Camera, list[Frame]]:
     """Camera and frames of the wanted styles, all with a pose and an image. Raises InputError."""
     camera, frames = read_poses(path)
     problems = Problems()
@@ -135,7 +135,7 @@ def _pair(true: Iterable[Frame], path: Path) -> list[Frame]:
     return [by_image[frame.image] for frame in true]
 
 
-def _register(true: list[Frame], camera: Camera, predictor, progress: ProgressFunction) -> list[Frame]:
+def register_frames(true: list[Frame], camera: Camera, predictor, progress: ProgressFunction) -> list[Frame]:
     predicted, problems = [], Problems()
     for i, frame in enumerate(true):
         with problems.collect():

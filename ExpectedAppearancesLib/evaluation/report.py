@@ -9,7 +9,7 @@ from pathlib import Path
 from .. import __version__, files
 
 # (heading, unit, path of keys in metrics.json, factor, digits)
-_COLUMNS = (
+COLUMNS = (
     ("frames", "", ("frames",), 1, 0),
     ("refused", "", ("refused",), 1, 0),
     ("ADD mean", "mm", ("add_mm", "mean"), 1, 2),
@@ -24,10 +24,7 @@ _COLUMNS = (
     ("translation", "mm", ("translation_mm",), 1, 2),
 )
 
-_TEMPLATE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Registration of {{ case }}</title>
-<style>
+STYLE_SHEET = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; max-width: 1180px; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.5em; margin-bottom: 0; } h2 { font-size: 1.15em; margin-top: 2em; }
 .note { color: #5b6876; } .scroll { overflow-x: auto; }
@@ -37,7 +34,12 @@ th:first-child, td:first-child { text-align: left; }
 thead th { border-bottom: 2px solid #9aa5b1; font-weight: 600; }
 tr.total td { font-weight: 600; } img { max-width: 100%; height: auto; }
 .true { color: #17953a; font-weight: 600; } .predicted { color: #2f62e0; font-weight: 600; }
-</style></head><body>
+"""
+
+_TEMPLATE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Registration of {{ case }}</title>
+<style>{{ style_sheet }}</style></head><body>
 <h1>Registration of {{ case }}</h1>
 <p class="note">{{ date }} &middot; ExpectedAppearances {{ version }} &middot;
 for research only, not a medical device</p>
@@ -69,16 +71,17 @@ def write_report(folder: Path, case_name: str, evaluation) -> None:
     result = evaluation.metrics
     template = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
     html = template.render(
+        style_sheet=STYLE_SHEET,
         case=case_name,
         date=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         version=__version__,
         headline=headline(result),
-        headings=[(name, unit) for name, unit, *_ in _COLUMNS],
-        rows=[{"name": name, "cells": _cells(values), "total": total} for name, values, total in _rows(result)],
+        headings=[(name, unit) for name, unit, *_ in COLUMNS],
+        rows=[{"name": name, "cells": cells(values), "total": total} for name, values, total in _rows(result)],
         without_pose=result["without_pose"],
-        curves=_embedded(folder / "curves.png"),
-        by_style=_embedded(folder / "styles.png") if len(result["styles"]) > 1 else "",
-        overlays=_embedded_photograph(folder / "overlays.png"),
+        curves=embedded(folder / "curves.png"),
+        by_style=embedded(folder / "styles.png") if len(result["styles"]) > 1 else "",
+        overlays=embedded_photograph(folder / "overlays.png"),
     )
     files.write_bytes(folder / "report.html", html.encode("utf-8"))
 
@@ -102,8 +105,8 @@ def headline(metrics: dict) -> str:
 
 def text_table(metrics: dict) -> str:
     """The same table for a terminal."""
-    table = [["", *(f"{name}, {unit}" if unit else name for name, unit, *_ in _COLUMNS)]]
-    table += [[name, *_cells(values)] for name, values, _ in _rows(metrics)]
+    table = [["", *(f"{name}, {unit}" if unit else name for name, unit, *_ in COLUMNS)]]
+    table += [[name, *cells(values)] for name, values, _ in _rows(metrics)]
     widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
     lines = (
         "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths)))
@@ -120,21 +123,23 @@ def _rows(metrics: dict) -> list[tuple[str, dict, bool]]:
     return rows
 
 
-def _cells(values: dict) -> list[str]:
-    cells = []
-    for _, _, keys, factor, digits in _COLUMNS:
+def cells(values: dict) -> list[str]:
+    """The texts of COLUMNS for one entry of metrics.json."""
+    texts = []
+    for _, _, keys, factor, digits in COLUMNS:
         value = values
         for key in keys:
             value = value[key]
-        cells.append("–" if value is None else f"{factor * value:.{digits}f}")
-    return cells
+        texts.append("–" if value is None else f"{factor * value:.{digits}f}")
+    return texts
 
 
-def _embedded(path: Path) -> str:
+def embedded(path: Path) -> str:
+    """A PNG file as a data URI."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
 
 
-def _embedded_photograph(path: Path) -> str:
+def embedded_photograph(path: Path) -> str:
     """As JPEG: a sheet of frames is several MB as PNG, too much for a report that is sent by mail."""
     import cv2
 

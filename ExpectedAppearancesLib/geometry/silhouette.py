@@ -22,12 +22,16 @@ class Silhouette:
         self._edges = np.stack([keys // count, keys % count], axis=1)
         self._sides = np.bincount(self._edge_of_side, minlength=len(keys))
 
-    def edges(self, camera_from_world: np.ndarray) -> np.ndarray:
-        """(E, 2) indices of the vertices of the outline's edges, from an OpenCV pose. Hidden outlines are included."""
+    def edges(self, camera_from_world: np.ndarray, facing_borders_only: bool = False) -> np.ndarray:
+        """(E, 2) indices of the vertices of the outline's edges, from an OpenCV pose. Hidden outlines are included.
+
+        facing_borders_only: leave out border edges of triangles that turn their back, which mostly hide behind others.
+        """
         centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
         towards = np.einsum("ij,ij->i", self._face_normals, centre_mm - self._face_points_mm) > 0
         facing = np.bincount(self._edge_of_side, np.tile(towards, 3), minlength=len(self._edges))
-        return self._edges[(self._sides == 1) | ((facing > 0) & (facing < self._sides))]
+        border = (self._sides == 1) & (facing >= (1 if facing_borders_only else 0))
+        return self._edges[border | ((facing > 0) & (facing < self._sides))]
 
     def on_plane(self, camera_from_world: np.ndarray, plane_depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """The outline seen from the pose, drawn on the plane z = plane_depth_mm of the camera.

@@ -10,10 +10,10 @@ import torch
 
 from .. import files
 from ..errors import ExpectedAppearancesError
+from ..registration.predictor import FORMAT_VERSION
 from .presets import Preset
 
 MODEL_NAME, META_NAME = "model.onnx", "model.json"
-FORMAT_VERSION = 1
 PARITY = 1e-4
 
 

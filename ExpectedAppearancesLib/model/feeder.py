@@ -1,4 +1,4 @@
-"""Batches of training views from a process of its own.
+"""Batches of training views from processes of their own.
 
 Rendering and training are kept apart: loading all of VTK and torch's optimisers into one process has crashed, and two
 processes use two cores.
@@ -6,6 +6,7 @@ processes use two cores.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import queue
@@ -34,14 +35,23 @@ class Batch:
 
 
 class Feeder:
-    """Yields the batches of views first, first + size, ... in order. A context manager: leaving it ends the process."""
+    """Yields the batches of views first, first + size, ... in order. A context manager: leaving it ends the processes.
 
-    def __init__(self, case_folder: Path, settings: ViewSettings, batch: int, first_batch: int = 0):
+    workers: processes that draw batches in turn; their number changes nothing in what is drawn.
+    """
+
+    def __init__(self, case_folder: Path, settings: ViewSettings, batch: int, first_batch: int = 0, workers: int = 1):
         context = multiprocessing.get_context("spawn")
-        self._queue = context.Queue(QUEUE_BATCHES)
-        self._process = context.Process(
-            target=_serve, args=(str(case_folder), settings, batch, first_batch, self._queue, os.getpid()), daemon=True
-        )
+        self._queues = [context.Queue(max(2, QUEUE_BATCHES // workers)) for _ in range(workers)]
+        self._processes = [
+            context.Process(
+                target=_serve,
+                args=(str(case_folder), settings, batch, first_batch + k, workers, own, os.getpid()),
+                daemon=True,
+            )
+            for k, own in enumerate(self._queues)
+        ]
+        self._taken = 0
 
     def __enter__(self) -> Feeder:
         # One thread each for numpy, OpenCV and Mesa's rasteriser: more would fight with training for its cores. They
@@ -49,7 +59,8 @@ class Feeder:
         usual = {name: os.environ.get(name) for name in THREAD_LIMITS}
         os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
         try:
-            self._process.start()
+            for process in self._processes:
+                process.start()
         finally:
             for name, value in usual.items():
                 if value is None:
@@ -59,22 +70,26 @@ class Feeder:
         return self
 
     def __exit__(self, *_error) -> None:
-        self._process.terminate()
-        self._process.join(10)
-        self._queue.cancel_join_thread()
-        self._queue.close()
+        for process, own in zip(self._processes, self._queues):
+            process.terminate()
+            process.join(10)
+            own.cancel_join_thread()
+            own.close()
 
     def next(self) -> Batch:
         """The next batch. Raises RuntimeError with the other process's traceback when it failed."""
+        turn = self._taken % len(self._queues)
         for _ in range(int(TIMEOUT_S)):
             try:
-                item = self._queue.get(timeout=1.0)
+                item = self._queues[turn].get(timeout=1.0)
             except queue.Empty:
-                if self._process.is_alive():
+                process = self._processes[turn]
+                if process.is_alive():
                     continue
-                raise RuntimeError(f"rendering of training views ended (exit code {self._process.exitcode})") from None
+                raise RuntimeError(f"rendering of training views ended (exit code {process.exitcode})") from None
             if isinstance(item, str):
                 raise RuntimeError(f"rendering of training views failed:\n{item}")
+            self._taken += 1
             return Batch(*item)
         raise RuntimeError(f"no training view was rendered in {TIMEOUT_S:.0f} s")
 
@@ -105,13 +120,17 @@ class ViewMemory:
         return list(zip(*vars(batch).values(), strict=True))
 
 
-def draw_views(case_folder: Path, settings: ViewSettings, count: int) -> Batch:
+def draw_views(case_folder: Path, settings: ViewSettings, count: int, workers: int = 1) -> Batch:
     """Views 0 ... count - 1 at once, through a feeder."""
-    with Feeder(case_folder, settings, count) as feeder:
-        return feeder.next()
+    size = min(count, 16)
+    with Feeder(case_folder, settings, size, workers=workers) as feeder:
+        drawn = [feeder.next() for _ in range(math.ceil(count / size))]
+    return Batch(*(np.concatenate(parts)[:count] for parts in zip(*(vars(batch).values() for batch in drawn))))
 
 
-def _serve(case_folder: str, settings: ViewSettings, batch: int, first_batch: int, out, parent: int) -> None:
+def _serve(
+    case_folder: str, settings: ViewSettings, batch: int, first_batch: int, stride: int, out, parent: int
+) -> None:
     try:
         import cv2
 
@@ -131,7 +150,7 @@ def _serve(case_folder: str, settings: ViewSettings, batch: int, first_batch: in
                     np.stack([v.vessels for v in views]),
                 )
             )
-            number += 1
+            number += stride
     except KeyboardInterrupt:
         pass
     except BaseException:  # the training process must learn of it, whatever it is

@@ -14,6 +14,13 @@ def regression_loss(output: torch.Tensor, target: torch.Tensor, encoding: PoseEn
     return (translation.norm(dim=1) + (output[:, :3] - target[:, :3]).norm(dim=1)).mean()
 
 
+def segmentation_loss(logits: torch.Tensor, vessels: torch.Tensor) -> torch.Tensor:
+    """Cross-entropy of the vessels plus 1 - Dice: vessels fill a small part of a view. Both (B, 1, G, G)."""
+    probability = torch.sigmoid(logits)
+    dice = (2 * (probability * vessels).sum() + 1) / (probability.sum() + vessels.sum() + 1)
+    return F.binary_cross_entropy_with_logits(logits, vessels) + 1 - dice
+
+
 def dense_loss(
     output: torch.Tensor, points_mm: torch.Tensor, surface: torch.Tensor, vessels: torch.Tensor, encoding: PoseEncoding
 ) -> torch.Tensor:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,16 +17,22 @@ import torch
 from .. import files
 from ..appearances.store import folder_of, read_appearances
 from ..case.case import Case
+from ..case.meshes import write_vtp
 from ..devices import fast_dtype
 from ..evaluation.metrics import add_mm
-from ..masks.stage import craniotomy_of, sampler_of
+from ..masks.exposed import exposed_vessels
+from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
+from ..registration.covariance import CovarianceModel, calibrate_covariance, correlated, pose_error
 from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
+from ..registration.predictor import EXPOSED_VESSELS_NAME
+from ..registration.refinement import VesselAligner
 from . import checkpoint
 from .encoding import PoseEncoding, fit_encoding, network_camera
 from .export import export_model
 from .feeder import Batch, Feeder, ViewMemory, draw_views
-from .losses import dense_loss, regression_loss
+from .fold import Fold
+from .losses import dense_loss, regression_loss, segmentation_loss
 from .networks import build_network
 from .presets import PAPER_EPOCHS, Preset
 from .views import ViewSettings
@@ -41,59 +49,89 @@ def train_case(
     device: torch.device,
     seed: int = 0,
     method: str | None = None,
+    fold: Fold | None = None,
 ) -> dict:
     """Train, calibrate, export to case.model_folder; returns the validation figures that are put on record.
 
     Validation (inner split): poses of another seed and, with 4 textures or more, a texture that is not trained on.
+    fold: train a model of a study into a folder of its own instead; the case's model and manifest stay as they are.
     """
     method, appearances = read_appearances(case, method)
-    styles = sorted({a.style for a in appearances})
-    held_out = styles[len(styles) // 2 :: 8] if len(styles) >= 4 else []
+    styles = fold.styles(method, appearances) if fold else sorted({a.style for a in appearances})
+    inner_split = len(styles) >= 4 and (fold is None or fold.inner_texture)
+    held_out = styles[len(styles) // 2 :: 8] if inner_split else []
     trained_on = [s for s in styles if s not in held_out]
-    if preset.estimator == "regression":
+    if preset.estimator == "regression" and method == "image":
         steps = math.ceil(PAPER_EPOCHS * sum(a.style in trained_on for a in appearances) / preset.batch)
         preset = replace(preset, steps=min(preset.steps, steps))
     views = ViewSettings(
         method, preset.size_px, tuple(trained_on), preset.fresh_poses, preset.negatives, preset.elastic_px, seed + 1
     )
+    if fold and fold.poses_path:
+        views = replace(views, poses_file=str(Path(fold.poses_path).absolute()))
     validation_views = replace(views, styles=tuple(held_out or styles), negatives=0.0, seed=seed + 1001)
     poses = np.stack([sampler_of(case, seed + 1).sample(i) for i in range(400)])
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
-    trainer = _Trainer(case, preset, encoding, device, seed, views)
+    folder = fold.folder if fold else case.model_folder
+    trainer = _Trainer(case, preset, encoding, device, seed, views, folder)
+    made_from = files.sha256(folder_of(case, method) / "index.json")
     progress(0.0, "rendering validation views")
-    validation = draw_views(case.folder, validation_views, preset.validation_views)
-    case.record("train", preset=preset.to_dict(), seed=seed, styles=trained_on, held_out_styles=held_out, done=False)
+    workers = max(1, (os.cpu_count() or 2) - 1)
+    validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
+    on_record = {"preset": preset.to_dict(), "seed": seed, "styles": trained_on, "held_out_styles": held_out}
+    if fold is None:
+        case.record("train", **on_record, done=False)
     trainer.run(validation, progress)
     progress(1.0, "calibrating confidence")
-    calibration = draw_views(
-        case.folder, replace(validation_views, negatives=0.3, seed=seed + 2001), 2 * preset.validation_views
-    )
-    figures = trainer.export(calibration, validation)
-    case.record(
-        "train",
-        done=True,
-        validation=figures,
-        method=method,
-        model_sha256=files.sha256(case.model_folder / "model.onnx"),
-    )
+    calibration_views = replace(validation_views, negatives=0.3, seed=seed + 2001)
+    calibration = draw_views(case.folder, calibration_views, 4 * preset.validation_views, workers)
+    figures = trainer.export(calibration, validation, on_record)
+    if fold is None:
+        model_sha256 = files.sha256(case.model_folder / "model.onnx")
+        case.record(
+            "train",
+            done=True,
+            validation=figures,
+            method=method,
+            appearances_sha256=made_from,
+            model_sha256=model_sha256,
+        )
     return figures
+
+
+def _feeder_workers(device: torch.device) -> int:
+    """Processes that render: on a CPU they share the cores with training, beside a GPU they have all but two."""
+    cores = os.cpu_count() or 2
+    return max(1, cores - 2) if device.type == "cuda" else max(1, cores // 3)
 
 
 class _Trainer:
     """Network, optimiser, running average and schedule of one run."""
 
     def __init__(
-        self, case: Case, preset: Preset, encoding: PoseEncoding, device: torch.device, seed: int, views: ViewSettings
+        self,
+        case: Case,
+        preset: Preset,
+        encoding: PoseEncoding,
+        device: torch.device,
+        seed: int,
+        views: ViewSettings,
+        folder: Path,
     ):
+        self.folder = folder
         self.case, self.preset, self.encoding, self.device, self.views = case, preset, encoding, device, views
         self.camera = network_camera(case.camera, preset.size_px)
         torch.manual_seed(seed)
-        network = build_network(preset.estimator, preset.size_px, preset.width).to(device)
+        network = build_network(preset.estimator, preset.size_px, preset.width, preset.reads).to(device)
         self.network = network.to(memory_format=torch.channels_last)
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=preset.learning_rate, weight_decay=1e-4)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=preset.learning_rate, weight_decay=1e-4, fused=True
+        )
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.best = self.average
         craniotomy = craniotomy_of(case)
+        self.exposed = exposed_vessels(case.vessels, parenchyma_of(case, craniotomy), craniotomy.outward_axis)
+        self.aligner = VesselAligner(self.exposed.vertices_mm, self.exposed.triangles, self.camera)
         ranges = sampler_of(case, 0).ranges
         distance = ranges.working_distance_mm
         self.plausible = PlausibleView(
@@ -111,17 +149,20 @@ class _Trainer:
         }
 
     def run(self, validation: Batch, progress: Callable[[float, str], None]) -> None:
-        restored = checkpoint.load(self.case.model_folder, self.network, self.optimizer, self.state["settings"])
+        restored = checkpoint.load(self.folder, self.network, self.optimizer, self.state["settings"])
         if restored:
             self.average, self.best, self.state = restored
             logging.info("resuming at step %d", self.state["step"])
         state, preset = self.state, self.preset
         begin = time.monotonic() - state["seconds"]
         saved = time.monotonic()
+        if self.device.type == "cpu":
+            # Rendering has cores of its own: threads that wait for each other on one core cost more than they give.
+            torch.set_num_threads(max(1, (os.cpu_count() or 2) - _feeder_workers(self.device)))
         use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
-        with Feeder(self.case.folder, self.views, preset.fresh, first) as feeder:
+        with Feeder(self.case.folder, self.views, preset.fresh, first, _feeder_workers(self.device)) as feeder:
             memory = ViewMemory(feeder, preset.batch, preset.remembered, self.views.seed)
             while True:
                 done = max(state["step"] / preset.steps, state["seconds"] / 60 / preset.minutes)
@@ -133,7 +174,7 @@ class _Trainer:
                     group["lr"] = self._learning_rate(done)
                 self.network.train()
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16):
-                    output = self.network(self._images(batch))
+                    output = self.network(self._images(batch), *self._rendered(batch))
                 loss = self._loss(output, batch)
                 self.optimizer.zero_grad(set_to_none=True)
                 loss.backward()
@@ -156,8 +197,9 @@ class _Trainer:
         self._validate(validation, recent)
         self._save()
 
-    def export(self, calibration: Batch, validation: Batch) -> dict:
-        """Calibrate the best network's confidence and write the model; returns its validation figures."""
+    def export(self, calibration: Batch, validation: Batch, on_record: dict) -> dict:
+        """Calibrate the best network's confidence and write the model with what it was trained on; returns its
+        validation figures."""
         self.network.load_state_dict(self.best)
         self.network.eval()
         readings = self._read(calibration)
@@ -169,6 +211,7 @@ class _Trainer:
         confidence = calibrate(evidence.reshape(usable.sum(), EVIDENCE[self.preset.estimator]), good[usable])
         probability = np.array([confidence.probability(r.evidence) for r in readings])
         accepted = probability >= confidence.threshold
+        covariance = self._covariance(readings, calibration, positive, probability, confidence.threshold)
         held_out_add = self._add(self._read(validation), validation)
         figures = {
             "add_mm_mean": round(float(held_out_add.mean()), 4),
@@ -184,30 +227,44 @@ class _Trainer:
         meta = {
             "estimator": self.preset.estimator,
             "preset": self.preset.name,
+            "styles": on_record["styles"],
+            "held_out_styles": on_record["held_out_styles"],
             "size_px": self.preset.size_px,
             "camera": self.case.camera.to_dict(),
             "encoding": self.encoding.to_dict(),
             "plausible_view": self.plausible.to_dict(),
             "confidence": confidence.to_dict(),
+            "covariance": covariance.to_dict(),
             "validation": figures,
             "vessels_sha256": self.case.manifest["inputs"]["vessels"]["sha256"],
         }
-        files.write_json(
-            self.case.model_folder / "training.json", {"curve": self.state["curve"], "validation": figures}
-        )
-        export_model(self.network.cpu(), self.preset, meta, self.case.model_folder)
+        files.write_json(self.folder / "training.json", {"curve": self.state["curve"], "validation": figures})
+        write_vtp(self.folder / EXPOSED_VESSELS_NAME, self.exposed)
+        export_model(self.network.cpu(), self.preset, meta, self.folder)
         return figures
 
     def _images(self, batch: Batch) -> torch.Tensor:
         images = torch.from_numpy(batch.images).to(self.device).permute(0, 3, 1, 2).float() / 255
         return images.contiguous(memory_format=torch.channels_last)
 
-    def _loss(self, output: torch.Tensor, batch: Batch) -> torch.Tensor:
+    def _rendered(self, batch: Batch) -> tuple[torch.Tensor, ...]:
+        """What a network that reads vessel masks is shown besides the image: the rendered ones."""
+        if self.preset.reads == "image":
+            return ()
+        return (torch.from_numpy(batch.vessels).to(self.device)[:, None].float(),)
+
+    def _loss(self, output, batch: Batch) -> torch.Tensor:
+        if self.preset.reads != "image":
+            logits, pose = output
+            return segmentation_loss(logits, self._rendered(batch)[0]) + self._pose_loss(pose, batch)
         if self.preset.estimator == "regression":
-            target = np.stack([self.encoding.encode(pose) for pose in batch.camera_from_world])
-            return regression_loss(output, torch.from_numpy(target).float().to(self.device), self.encoding)
+            return self._pose_loss(output, batch)
         tensors = (torch.from_numpy(a).to(self.device) for a in (batch.points_mm, batch.surface, batch.vessels))
         return dense_loss(output, *tensors, self.encoding)
+
+    def _pose_loss(self, output: torch.Tensor, batch: Batch) -> torch.Tensor:
+        target = np.stack([self.encoding.encode(pose) for pose in batch.camera_from_world])
+        return regression_loss(output, torch.from_numpy(target).float().to(self.device), self.encoding)
 
     def _learning_rate(self, done: float) -> float:
         """The paper's exponential decay for its network; for the dense one a short warm-up, then cosine decay."""
@@ -220,11 +277,11 @@ class _Trainer:
     @torch.no_grad()
     def _update_average(self, step: int) -> None:
         decay = min(AVERAGE_DECAY, (1 + step) / (10 + step))
-        for key, value in self.network.state_dict().items():
-            if value.is_floating_point():
-                self.average[key].lerp_(value, 1 - decay)
-            else:
-                self.average[key].copy_(value)
+        values = self.network.state_dict()
+        floating = [key for key, value in values.items() if value.is_floating_point()]
+        torch._foreach_lerp_([self.average[key] for key in floating], [values[key] for key in floating], 1 - decay)
+        for key in values.keys() - set(floating):
+            self.average[key].copy_(values[key])
 
     @torch.no_grad()
     def _validate(self, validation: Batch, recent: list[float]) -> None:
@@ -246,7 +303,7 @@ class _Trainer:
         outputs = np.concatenate([self.network(images[i : i + 32]).cpu().numpy() for i in range(0, len(images), 32)])
         if self.preset.estimator == "regression":
             return [read_regression(output, self.encoding) for output in outputs]
-        return [read_dense(output, self.camera, self.encoding) for output in outputs]
+        return [read_dense(output, self.camera, self.encoding, self.aligner) for output in outputs]
 
     def _add(self, readings: list[Reading], batch: Batch) -> np.ndarray:
         vertices = self.case.vessels.vertices_mm[::20]
@@ -258,5 +315,16 @@ class _Trainer:
         ]
         return np.array(errors)
 
+    def _covariance(self, readings, batch: Batch, positive, probability, threshold: float) -> CovarianceModel:
+        """From the accepted of the true views, at least the more trusted half: a refused pose is not used."""
+        found = np.array([r.camera_from_world is not None for r in readings]) & positive
+        least = min(threshold, np.median(probability[found])) if found.any() else threshold
+        chosen = np.flatnonzero(found & (probability >= least))
+        centre = self.encoding.centre_world_mm
+        errors = [pose_error(batch.camera_from_world[i], readings[i].camera_from_world, centre) for i in chosen]
+        none = np.zeros((6, 6))
+        fits = [none if readings[i].fit is None else correlated(readings[i].fit, centre) for i in chosen]
+        return calibrate_covariance(np.array(errors).reshape(-1, 6), np.array(fits).reshape(-1, 6, 6))
+
     def _save(self) -> None:
-        checkpoint.save(self.case.model_folder, self.network, self.average, self.best, self.optimizer, self.state)
+        checkpoint.save(self.folder, self.network, self.average, self.best, self.optimizer, self.state)

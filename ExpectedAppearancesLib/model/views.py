@@ -12,18 +12,21 @@ import cv2
 import numpy as np
 
 from .. import files
+from ..appearances.projection import SurfacePainter
 from ..appearances.store import Appearance, read_appearances
 from ..augmentation import elastic, microscope
+from ..augmentation.impostors import impostor
+from ..augmentation.surroundings import fill_outside, opening
 from ..case.case import Case
-from ..geometry.pose import pose_from_rotation, rotation_matrix, transform
+from ..geometry.pose import pose_from_rotation, rotation_matrix
 from ..masks.labels import BACKGROUND, VESSELS
 from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..poses.sampling import PoseSampler
 from .encoding import network_camera
+from .fold import known_poses, seen_from
 
-OVERSAMPLING = 2  # views are composed at twice the network's size, then averaged: frames are anti-aliased too
-MIX_CLASSES = 0.35  # share of views whose vessels and parenchyma come from different textures
+COMPOSED_PX = 256  # smaller views are composed at twice their size, then averaged: frames are anti-aliased too
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,11 @@ class View:
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """How views are drawn. styles: textures used. negatives: share of views of something else."""
+    """How views are drawn. styles: textures used. negatives: share of views of something else.
+
+    poses_file: views are seen from this file's poses only (the paper's protocol repeats its poses); None: from fresh
+    ones.
+    """
 
     method: str
     size_px: int
@@ -49,6 +56,7 @@ class ViewSettings:
     negatives: float
     elastic_px: float
     seed: int
+    poses_file: str | None = None
 
 
 class ViewSource:
@@ -58,13 +66,27 @@ class ViewSource:
         self.case = Case.open(case_folder)
         self.settings = settings
         craniotomy = craniotomy_of(self.case)
+        parenchyma = parenchyma_of(self.case, craniotomy)
         self.camera = network_camera(self.case.camera, settings.size_px)
-        self._large = self.camera.resized(*(2 * [settings.size_px * OVERSAMPLING]))
-        self._renderer = MaskRenderer(self.case.vessels, parenchyma_of(self.case, craniotomy), self._large)
+        self._oversampling = 2 if 2 * settings.size_px <= COMPOSED_PX else 1
+        self._large = self.camera.resized(*(2 * [settings.size_px * self._oversampling]))
+        self._renderer = MaskRenderer(self.case.vessels, parenchyma, self._large)
         self._sampler: PoseSampler = sampler_of(self.case, settings.seed)
         _, appearances = read_appearances(self.case, settings.method)
         self._appearances = [a for a in appearances if a.style in settings.styles]
         self._images: dict[Path, np.ndarray] = {}
+        self._poses = known_poses(Path(settings.poses_file)) if settings.poses_file else None
+        if self._poses is not None and settings.method == "image":
+            self._appearances = [a for a in self._appearances if seen_from(a, self._poses)]
+        self._painter = None
+        if settings.method == "surface":
+            self._painter = SurfacePainter(self.case.vessels, parenchyma, self._appearances)
+        # The surface's outline seen from the front: where the craniotomy's edge is drawn.
+        axis, up = craniotomy.outward_axis, craniotomy.up
+        self._frontal = np.float32([np.cross(axis, up), up])
+        across = parenchyma.vertices_mm @ self._frontal.T
+        self._middle_mm = (across.min(axis=0) + across.max(axis=0)) / 2
+        self._extent_mm = float((across.max(axis=0) - across.min(axis=0)).mean())
         rows, columns = np.mgrid[0 : self._large.height, 0 : self._large.width]
         self._grid = np.stack([columns, rows], axis=-1).astype(np.float32)
         frame = self.case.camera
@@ -76,42 +98,34 @@ class ViewSource:
 
     def view(self, index: int) -> View:
         rng = np.random.default_rng([self.settings.seed, 7, index])
-        appearance = self._appearances[rng.integers(len(self._appearances))]
-        on_surface = self.settings.method == "surface"
-        turn = np.eye(3)
-        if on_surface:
-            pose = self._sampler.sample(index)
+        if self._painter:
+            seen = self._poses
+            pose = self._sampler.sample(index) if seen is None else seen[rng.integers(len(seen))]
+            labels, depth_mm, points = self._renderer.render_surface(pose)
+            image = self._painter.paint(labels, depth_mm, self._painter.overview_px(points), pose, rng)
+            cortex = self._painter.cortex(rng)
         else:
-            if self.settings.fresh_poses:
-                turn = self._camera_turn(appearance.camera_from_world, rng)
+            appearance = self._appearances[rng.integers(len(self._appearances))]
+            fresh = self.settings.fresh_poses and self._poses is None
+            turn = self._camera_turn(appearance.camera_from_world, rng) if fresh else np.eye(3)
             pose = pose_from_rotation(turn, np.zeros(3)) @ appearance.camera_from_world
-        labels, _, points = self._renderer.render_surface(pose)
+            labels, _, points = self._renderer.render_surface(pose)
+            image = self._turned(appearance, turn)
+            cortex = self._image(appearance)
+        hidden = opening(cv2.transform(points, self._frontal), self._middle_mm, self._extent_mm, rng)
+        if hidden is not None:
+            labels *= hidden
         self._clear_bars(labels, 1)
-        image = self._project(appearance, labels, points, rng) if on_surface else self._turned(appearance, turn)
-        image = self._fill_background(image, labels, rng)
+        image = fill_outside(image, labels == BACKGROUND, cortex, rng)
         return self._finish(image, pose, labels, points, rng)
-
-    def close(self) -> None:
-        self._renderer.close()
 
     def _image(self, appearance: Appearance) -> np.ndarray:
         if appearance.image_path not in self._images:
             self._images[appearance.image_path] = files.read_image_rgb(appearance.image_path)
         return self._images[appearance.image_path]
 
-    def _project(self, appearance: Appearance, labels: np.ndarray, points: np.ndarray, rng) -> np.ndarray:
-        """The overview's appearance seen on the surface from elsewhere, lit from a random side."""
-        # Single precision is good for a micrometre here, and twice as fast.
-        seen = transform(appearance.camera_from_world.astype(np.float32), points.reshape(-1, 3))
-        camera = appearance.camera
-        where = seen[:, :2] * (np.float32([camera.fx, camera.fy]) / seen[:, 2:]) + np.float32([camera.cx, camera.cy])
-        where = where.reshape(*labels.shape, 2)
-        image = cv2.remap(self._image(appearance), where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        if rng.uniform() < MIX_CLASSES:
-            other = self._appearances[rng.integers(len(self._appearances))]
-            vessels = cv2.remap(self._image(other), where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            image = np.where((labels == VESSELS)[..., None], vessels, image)
-        return _lit(image, points, labels, rng)
+    def close(self) -> None:
+        self._renderer.close()
 
     def _camera_turn(self, camera_from_world: np.ndarray, rng) -> np.ndarray:
         """A rotation of the camera about its own centre: it changes the image by a homography, exactly."""
@@ -131,35 +145,26 @@ class ViewSource:
         size = (self._large.width, self._large.height)
         return cv2.warpPerspective(self._image(appearance), homography, size, flags=cv2.INTER_LINEAR)
 
-    def _fill_background(self, image: np.ndarray, labels: np.ndarray, rng) -> np.ndarray:
-        """Outside the craniotomy: mostly black, else drapes and skin stood in for by smooth random colour."""
-        outside = (labels == BACKGROUND)[..., None]
-        if rng.uniform() < 0.55:
-            return np.where(outside, np.uint8(0), image)
-        coarse = rng.integers(0, 256, (*rng.integers(1, 7, 2), 3)).astype(np.uint8)
-        drape = cv2.resize(coarse, labels.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        grain = rng.normal(0, rng.uniform(0, 20), (32, 32)).astype(np.float32)
-        drape = drape + cv2.resize(grain, labels.shape[::-1], interpolation=cv2.INTER_LINEAR)[..., None]
-        return np.where(outside, np.clip(drape, 0, 255).astype(np.uint8), image)
-
     def _finish(self, image, pose, labels, points, rng) -> View:
         size = self.settings.size_px
-        small = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA) if len(image) > size else image
         if self.settings.elastic_px > 0:
-            amplitude = self.settings.elastic_px * size / 128 * rng.uniform()
-            field = elastic.displacement_field((size, size), amplitude, size * rng.uniform(0.12, 0.3), rng)
+            # Smooth: a coarse field holds it. Its unit is a pixel of 128.
+            amplitude = self.settings.elastic_px / 2 * rng.uniform()
+            coarse = elastic.displacement_field((64, 64), amplitude, 64 * rng.uniform(0.12, 0.3), rng)
+            field = cv2.resize(coarse * np.float32(size / 64), (size, size), interpolation=cv2.INTER_LINEAR)
             small = elastic.warp(small, field)
             # The brain moves and takes its points along: what a pixel shows stays true, the pose's mean does too.
-            large = cv2.resize(field, labels.shape[::-1], interpolation=cv2.INTER_LINEAR) * OVERSAMPLING
+            large = cv2.resize(coarse * np.float32(len(labels) / 64), labels.shape[::-1])
             moved = self._grid + large
             labels = cv2.remap(labels, moved, None, cv2.INTER_NEAREST)
             points = cv2.remap(points, moved, None, cv2.INTER_NEAREST)
         small = microscope.apply(small, rng)
-        points, surface, vessels = _to_grid(points, labels, 2 * OVERSAMPLING)
+        points, surface, vessels = _to_grid(points, labels, 2 * self._oversampling)
         if rng.uniform() < self.settings.negatives:
-            small = _something_else(small, rng)
+            small = impostor(small, rng)
             surface, vessels = np.zeros_like(surface), np.zeros_like(vessels)
-        self._clear_bars(small, OVERSAMPLING)
+        self._clear_bars(small, self._oversampling)
         return View(small, pose, points, surface, vessels)
 
     def _clear_bars(self, array: np.ndarray, reduction: int) -> None:
@@ -170,24 +175,6 @@ class ViewSource:
         rows, columns = (bar // reduction for bar in self._bars)
         array[:rows], array[len(array) - rows :] = 0, 0
         array[:, :columns], array[:, array.shape[1] - columns :] = 0, 0
-
-
-def _lit(image: np.ndarray, points_mm: np.ndarray, labels: np.ndarray, rng) -> np.ndarray:
-    """Lambert shading by one distant light at a random place above the surface; its strength at random too."""
-    strength = rng.uniform(0.0, 0.6)
-    light = rng.normal(size=3).astype(np.float32)
-    coarse = points_mm[::2, ::2]
-    along, down = np.zeros_like(coarse), np.zeros_like(coarse)
-    along[:, :-1] = coarse[:, 1:] - coarse[:, :-1]
-    down[:-1] = coarse[1:] - coarse[:-1]
-    normals = np.cross(along, down)
-    length = np.sqrt(np.einsum("ijk,ijk->ij", normals, normals))
-    mean = normals[labels[::2, ::2] != BACKGROUND].mean(axis=0) if (labels != BACKGROUND).any() else light
-    light = mean / max(np.linalg.norm(mean), 1e-9) + 0.35 * light
-    cosine = np.maximum(normals @ (light / np.linalg.norm(light)), 0) / np.maximum(length, 1e-9)
-    cosine = cv2.resize(cv2.blur(cosine.astype(np.float32), (3, 3)), labels.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    shade = np.where(labels == BACKGROUND, np.float32(1), (1 - strength) + strength * cosine)
-    return cv2.multiply(image, cv2.merge([shade] * 3), dtype=cv2.CV_8U)
 
 
 def _to_grid(points_mm: np.ndarray, labels: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -207,21 +194,3 @@ def _to_grid(points_mm: np.ndarray, labels: np.ndarray, step: int) -> tuple[np.n
         total += points_mm[row::step, column::step]
     total[~surface] = 0
     return total / 4, surface.astype(np.uint8), (vessels >= 2).astype(np.uint8)
-
-
-def _something_else(image: np.ndarray, rng) -> np.ndarray:
-    """Cortex that is not this case's: mirrored (no rotation makes it the same), shuffled, smeared, or plain noise."""
-    kind = rng.integers(4)
-    if kind <= 1:
-        return np.ascontiguousarray(image[:, ::-1])
-    if kind == 2:
-        parts = int(rng.integers(3, 7))
-        side = len(image) // parts
-        tiles = [(r * side, c * side) for r in range(parts) for c in range(parts)]
-        result = image.copy()
-        for (row, column), k in zip(tiles, rng.permutation(len(tiles)), strict=True):
-            tile = image[tiles[k][0] : tiles[k][0] + side, tiles[k][1] : tiles[k][1] + side]
-            result[row : row + side, column : column + side] = np.rot90(tile, rng.integers(4))
-        return result
-    coarse = rng.integers(0, 256, (*rng.integers(1, 40, 2), 3)).astype(np.uint8)
-    return cv2.resize(coarse, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)

@@ -149,13 +149,22 @@ def camera_from_pixel(camera: Camera, plane_mm: float) -> np.ndarray:
 
 def add_frustum(scene, camera: Camera, plane_mm: float, parent):
     """Add the line model 'Camera frustum': from the camera's centre to the outer edges of the frame on its plane."""
+    node = _add_model(scene, FRUSTUM, _frustum(camera, plane_mm), parent)
+    node.GetDisplayNode().SetLighting(False)
+    return node
+
+
+def set_frustum(frustum_node, camera: Camera, plane_mm: float) -> None:
+    """Redraw the frustum for a frame of another size or on another plane."""
+    frustum_node.SetAndObservePolyData(_frustum(camera, plane_mm))
+
+
+def _frustum(camera: Camera, plane_mm: float):
     right, bottom = camera.width - 0.5, camera.height - 0.5
     corners = np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
     points_mm = np.vstack([np.zeros(3), transform(camera_from_pixel(camera, plane_mm), corners)])
     lines = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])
-    node = _add_model(scene, FRUSTUM, _line_polydata(points_mm, lines), parent)
-    node.GetDisplayNode().SetLighting(False)
-    return node
+    return _line_polydata(points_mm, lines)
 
 
 def add_outline(scene, silhouette: Silhouette, camera_from_world: np.ndarray, plane_mm: float, parent):

@@ -11,8 +11,9 @@ from ..geometry.pose import inverse, transform
 from ..model.encoding import PoseEncoding
 from .confidence import logistic
 from .pnp import PoseFit, fit_pose
+from .refinement import VesselAligner
 
-EVIDENCE = {"dense": 8, "regression": 0}  # numbers of evidence that an estimator gives
+EVIDENCE = {"dense": 11, "regression": 0}  # numbers of evidence that an estimator gives
 LEAST_CELLS = 40  # fewer cells of surface than this cannot carry a pose
 
 
@@ -61,8 +62,10 @@ def cell_pixels(grid: int) -> np.ndarray:
     return np.stack([columns, rows], axis=-1).reshape(-1, 2) * 2.0 + 0.5
 
 
-def read_dense(output: np.ndarray, camera: Camera, encoding: PoseEncoding, seed: int = 0) -> Reading:
-    """output (6, G, G) of DenseSurfaceNet; camera: network camera of that frame."""
+def read_dense(
+    output: np.ndarray, camera: Camera, encoding: PoseEncoding, aligner: VesselAligner, seed: int = 0
+) -> Reading:
+    """output (6, G, G) of DenseSurfaceNet; camera: network camera of that frame; aligner: of the case's vessels."""
     grid = output.shape[-1]
     flat = output.reshape(6, -1).astype(np.float64)
     surface = logistic(flat[4])
@@ -74,6 +77,7 @@ def read_dense(output: np.ndarray, camera: Camera, encoding: PoseEncoding, seed:
     fit = fit_pose(points, cell_pixels(grid)[used], sigma_mm, camera, seed)
     if fit is None:
         return Reading(None, None)
+    aligned = aligner.align(fit, output[5], output[4])
     vessel = logistic(flat[5, used])
     evidence = np.array(
         [
@@ -85,9 +89,12 @@ def read_dense(output: np.ndarray, camera: Camera, encoding: PoseEncoding, seed:
             surface[used].mean(),
             np.abs(2 * vessel - 1).mean(),
             np.log((vessel > 0.5).mean() + 1e-3),
+            aligned.matched,
+            aligned.residual_px,
+            np.log(aligned.moved_mm + 0.1),
         ]
     )
-    return Reading(fit.camera_from_world, evidence, fit)
+    return Reading(aligned.fit.camera_from_world, evidence, aligned.fit)
 
 
 def read_regression(output: np.ndarray, encoding: PoseEncoding) -> Reading:

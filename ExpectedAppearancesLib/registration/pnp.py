@@ -18,13 +18,16 @@ ITERATIONS = 12
 
 @dataclass(frozen=True)
 class PoseFit:
-    """camera_from_world (4, 4); covariance (6, 6) of (rotation vector in the camera frame about the points' centre,
-    rad; translation, mm), as if all residuals were independent; inlier_share; residual: mean of |residual| / sigma."""
+    """camera_from_world (4, 4); centre_world_mm (3,): mean of the points; covariance (6, 6) of (rotation vector in the
+    camera frame about that centre, rad; translation, mm), as if all residuals were independent; inlier_share;
+    residual: mean of |residual| / sigma; residuals: how many points have weight."""
 
     camera_from_world: np.ndarray
+    centre_world_mm: np.ndarray
     covariance: np.ndarray
     inlier_share: float
     residual: float
+    residuals: int
 
     def expected_add_mm(self, radius_mm: float) -> float:
         """Root mean square displacement of points at `radius_mm` around the centre that the covariance stands for."""
@@ -85,19 +88,7 @@ def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_p
         # Huber weights, and none for what lies far off: an instrument, another patient's vessel.
         weight = np.where(scaled < HUBER, 1.0, HUBER / np.maximum(scaled, 1e-9)) / sigma_px**2
         weight = weight * (distance < 4 * threshold_px)
-        zero = np.zeros(len(depth))
-        x, y, z = turned.T
-        by_position = np.stack(
-            [
-                np.stack([focal[0] / depth[:, 0], zero, -focal[0] * seen[:, 0] / depth[:, 0] ** 2], axis=1),
-                np.stack([zero, focal[1] / depth[:, 0], -focal[1] * seen[:, 1] / depth[:, 0] ** 2], axis=1),
-            ],
-            axis=1,
-        )
-        by_rotation = by_position @ np.stack(
-            [np.stack([zero, z, -y], 1), np.stack([-z, zero, x], 1), np.stack([y, -x, zero], 1)], axis=1
-        )
-        jacobian = np.concatenate([by_rotation, by_position], axis=2)
+        jacobian = projection_jacobian(turned, seen, focal)
         weighted = jacobian * weight[:, None, None]
         information = np.einsum("nki,nkj->ij", weighted, jacobian) + 1e-9 * np.eye(6)
         step = np.linalg.solve(information, np.einsum("nki,nk->i", weighted, residual))
@@ -109,4 +100,25 @@ def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_p
         return None
     inlier_share = float((distance < threshold_px).mean())
     pose = pose_from_rotation(rotation, position - rotation @ centre)
-    return PoseFit(pose, np.linalg.inv(information), inlier_share, float(np.minimum(scaled, 10).mean()))
+    mean_residual = float(np.minimum(scaled, 10).mean())
+    return PoseFit(pose, centre, np.linalg.inv(information), inlier_share, mean_residual, int((weight > 0).sum()))
+
+
+def projection_jacobian(turned: np.ndarray, seen: np.ndarray, focal: np.ndarray) -> np.ndarray:
+    """(N, 2, 6): pixels by a small rotation of the camera-frame points about their centre, and by a translation.
+
+    turned (N, 3): the points less their centre, in camera axes; seen (N, 3): in the camera frame, mm.
+    """
+    depth, zero = np.maximum(seen[:, 2], 1.0), np.zeros(len(seen))
+    x, y, z = turned.T
+    by_position = np.stack(
+        [
+            np.stack([focal[0] / depth, zero, -focal[0] * seen[:, 0] / depth**2], axis=1),
+            np.stack([zero, focal[1] / depth, -focal[1] * seen[:, 1] / depth**2], axis=1),
+        ],
+        axis=1,
+    )
+    by_rotation = by_position @ np.stack(
+        [np.stack([zero, z, -y], 1), np.stack([-z, zero, x], 1), np.stack([y, -x, zero], 1)], axis=1
+    )
+    return np.concatenate([by_rotation, by_position], axis=2)

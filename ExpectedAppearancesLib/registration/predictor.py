@@ -10,25 +10,32 @@ import cv2
 import numpy as np
 
 from .. import files
+from ..case.meshes import read_mesh
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..model.encoding import PoseEncoding, network_camera
 from .confidence import Confidence
+from .covariance import CovarianceModel
 from .decoding import PlausibleView, read_dense, read_regression
+from .refinement import VesselAligner
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2: the vessels lie beside the model, poses are refined on them
+EXPOSED_VESSELS_NAME = "exposed_vessels.vtp"
 ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Prediction:
     """camera_from_world (4, 4), or None where no pose was found; accepted: whether it may be shown; confidence: the
-    calibrated probability (0..1) that ADD < 3 mm; latency_ms: frame to pose."""
+    calibrated probability (0..1) that ADD < 3 mm; latency_ms: frame to pose; covariance (6, 6) of the error (rotation
+    vector, rad; translation of the case's centre, mm) in the axes of the camera, as `covariance.py` defines it, or
+    None without a pose or where the model tells none."""
 
     camera_from_world: np.ndarray | None
     accepted: bool
     confidence: float
     latency_ms: float
+    covariance: np.ndarray | None = None
 
 
 class Predictor:
@@ -39,10 +46,11 @@ class Predictor:
 
         folder = Path(model_folder)
         meta = files.read_json(folder / "model.json", "trained model")
-        if not isinstance(meta, dict) or meta.get("format_version", FORMAT_VERSION + 1) > FORMAT_VERSION:
-            raise InputError(
-                f"{folder / 'model.json'}: made by a newer version; update ExpectedAppearances or train again."
-            )
+        version = meta.get("format_version") if isinstance(meta, dict) else None
+        if version != FORMAT_VERSION:
+            older = isinstance(version, int) and version < FORMAT_VERSION
+            way_out = "an older version; train again" if older else "a newer version; update ExpectedAppearances"
+            raise InputError(f"{folder / 'model.json'}: made by {way_out}.")
         path = folder / "model.onnx"
         if not path.is_file():
             raise InputError(f"{path}: trained model missing; run `train` first.")
@@ -64,7 +72,16 @@ class Predictor:
         self.encoding = PoseEncoding.from_dict(meta["encoding"])
         self.plausible = PlausibleView.from_dict(meta["plausible_view"])
         self.confidence = Confidence.from_dict(meta["confidence"])
+        self.covariance = CovarianceModel.from_dict(meta.get("covariance"))
+        if self.estimator == "dense":
+            vessels = read_mesh(folder / EXPOSED_VESSELS_NAME, "vessels of the trained model")
+            self.aligner = VesselAligner(vessels.vertices_mm, vessels.triangles, self.camera)
         self._maps: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+
+    @property
+    def gives_covariance(self) -> bool:
+        """False for a direct regression whose training calibrated none."""
+        return self.estimator != "regression" or bool(self.covariance.shared.any())
 
     def predict(self, image_rgb: np.ndarray, camera: Camera | None = None) -> Prediction:
         """Pose of a frame uint8 (H, W, 3) taken by `camera` (the case's if None; A is scaled to the frame's size).
@@ -78,11 +95,14 @@ class Predictor:
         if self.estimator == "regression":
             reading = read_regression(output, self.encoding)
         else:
-            reading = read_dense(output, self.camera, self.encoding)
+            reading = read_dense(output, self.camera, self.encoding, self.aligner)
         confidence = self.confidence.probability(reading.evidence)
         pose = reading.camera_from_world
         accepted = pose is not None and confidence >= self.confidence.threshold and self.plausible.holds(pose)
-        return Prediction(pose, bool(accepted), confidence, (time.perf_counter() - begin) * 1000)
+        covariance = None
+        if pose is not None:
+            covariance = self.covariance.covariance(reading.fit, self.encoding.centre_world_mm)
+        return Prediction(pose, bool(accepted), confidence, (time.perf_counter() - begin) * 1000, covariance)
 
     def _resample(self, image_rgb: np.ndarray, camera: Camera) -> np.ndarray:
         """The frame as the network's camera would have taken it: undistorted, same centre of projection."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -30,6 +31,11 @@ class Texture:
     name: str
     image: np.ndarray
     labels: np.ndarray
+
+    @property
+    def sha256(self) -> str:
+        """Of image and labels: what appearances made from the texture depend on."""
+        return hashlib.sha256(self.image.tobytes() + self.labels.tobytes()).hexdigest()
 
     def class_shares(self) -> dict[str, float]:
         """Share of the pixels in each class, for listings."""
@@ -95,6 +101,36 @@ def read_library(folder: Path, exclude: Iterable[str] = ()) -> list[Texture]:
         problems.add(f"{folder}: every texture is excluded; leave at least one.")
     problems.raise_if_any()
     return textures
+
+
+def list_textures(folder: Path) -> dict[str, tuple[Path, Path | None]]:
+    """Image and label map of each texture by name, unread; None where a label map is missing. {} for no folder.
+
+    For panels, which show what is there before all of it is right.
+    """
+    folder = Path(folder)
+    try:
+        images = _image_paths(folder)
+    except InputError:
+        return {}
+    labels = ((name, (folder / f"{name}{LABELS_SUFFIX}", folder / SHARED_LABELS)) for name in images)
+    return {name: (images[name], next((path for path in paths if path.is_file()), None)) for name, paths in labels}
+
+
+def read_texture(name: str, image_path: Path, labels_path: Path | None) -> Texture:
+    """One texture. Raises InputError with all its problems."""
+    if labels_path is None:
+        raise InputError(f"{image_path}: has no label map; label it, or remove it.")
+    problems = Problems()
+    image = labels = None
+    with problems.collect():
+        image = files.read_image_rgb(image_path)
+    with problems.collect():
+        labels = files.read_label_map(labels_path)
+    if image is not None and labels is not None:
+        problems.found.extend(check_texture(image_path, image, labels_path, labels))
+    problems.raise_if_any()
+    return Texture(name, image, labels)
 
 
 def check_texture(path: Path, image: np.ndarray, labels_path: Path, labels: np.ndarray) -> list[str]:

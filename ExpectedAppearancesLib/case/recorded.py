@@ -1,0 +1,150 @@
+"""What a case folder holds, read for `steps.plan_steps`: only files that changed are read again."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from .. import files
+from ..appearances.store import METHODS
+from ..errors import InputError
+from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
+from .case import MANIFEST_NAME, Case
+from .steps import Recorded
+
+LARGEST_HEADER_BYTES = 1 << 24
+
+
+class CaseReader:
+    """Reads one case folder again and again, cheaply. Each part is kept until its file changes."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple, tuple] = {}
+        self._case: Case | None = None
+
+    def case(self, folder: str) -> tuple[Case | None, str]:
+        """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
+        path = Path(folder) / MANIFEST_NAME
+        if not folder or not path.is_file():
+            return None, ""
+        return self._once(path, self._open)
+
+    def recorded(self, folder: str, method: str, limits: Limits) -> Recorded:
+        """All that the steps of the case depend on; `method` is that of the appearances."""
+        case, problem = self.case(folder)
+        if case is None:
+            return Recorded(problem=problem)
+        index_path = case.appearances_folder / method / "index.json"
+        index, index_sha256 = self._once(index_path, _read_index) or (None, "")
+        model = self._once(case.model_folder / "model.json", _read_object)
+        rows, stale = self.figures(case)
+        state = self._once(case.model_folder / "checkpoint.safetensors", training_state) or {}
+        return Recorded(
+            "",
+            case.manifest,
+            case.camera,
+            index,
+            overview_changed(case, index) if method == "surface" and index else False,
+            model,
+            index_sha256,
+            state.get("step", 0),
+            "stale" if stale else "known" if rows else "",
+            verdict(rows, limits) if rows else None,
+        )
+
+    def figures(self, case: Case) -> tuple[list[Figures], bool]:
+        """Rows of the validation table, study first, and whether the study is about older appearances."""
+        model = self._once(case.model_folder / "model.json", _read_object)
+        rows: list[Figures] = []
+        study = self._once(case.folder / "study" / "study.json", _read_object)
+        stale = False
+        if study:
+            try:
+                rows = figures_of_study(study)
+            except InputError:
+                rows = []
+            used = (study.get("inputs") or {}).get("appearances_sha256")
+            indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
+            stale = bool(rows and used) and used not in [index[1] for index in indices if index]
+        if model:
+            rows = rows + figures_of_model(model)
+        return rows, stale
+
+    def curve(self, case: Case) -> list[dict]:
+        """[{"step", "loss", "validation_add_mm"}] of the last training, of its last checkpoint while it goes on."""
+        state = self._once(case.model_folder / "checkpoint.safetensors", training_state) or {}
+        if state.get("curve"):
+            return state["curve"]
+        return (self._once(case.model_folder / "training.json", _read_object) or {}).get("curve", [])
+
+    def _open(self, path: Path) -> tuple[Case | None, str]:
+        try:
+            case = Case.open(path.parent)
+        except InputError as error:
+            return None, str(error)
+        known = self._case
+        if known and known.folder == case.folder and known.manifest["inputs"] == case.manifest["inputs"]:
+            # Only stages were recorded: the meshes need not be read again.
+            case.__dict__.update({n: known.__dict__[n] for n in ("vessels", "cortex") if n in known.__dict__})
+        self._case = case
+        return case, ""
+
+    def _once(self, path: Path, read: Callable[[Path], object]):
+        """read(path), again only where the file changed; None where there is no such file."""
+        try:
+            status = path.stat()
+        except OSError:
+            return None
+        version = (status.st_mtime_ns, status.st_size)
+        key = (str(path), read.__name__)
+        if key not in self._kept or self._kept[key][0] != version:
+            self._kept[key] = (version, read(path))
+        return self._kept[key][1]
+
+
+def training_state(path: Path) -> dict:
+    """What the training put beside the tensors of its checkpoint: step, curve, best ADD. {} where it cannot be read.
+
+    Read from the header alone: torch is not loaded for it.
+    """
+    try:
+        with open(path, "rb") as stream:
+            (length,) = struct.unpack("<Q", stream.read(8))
+            if length > LARGEST_HEADER_BYTES:
+                return {}
+            header = json.loads(stream.read(length))
+        return json.loads(header.get("__metadata__", {}).get("state", "{}"))
+    except (OSError, ValueError, struct.error, AttributeError):
+        return {}
+
+
+def overview_changed(case: Case, index: dict) -> bool:
+    """Whether method `surface` would look at the surface from elsewhere now than when the appearances were made."""
+    from ..appearances.overview import overview_view
+    from ..masks.stage import craniotomy_of, parenchyma_of
+
+    made_from, size_px = index["settings"].get("overview"), index["settings"].get("size_px")
+    if made_from is None or size_px is None:
+        return False  # made by an older version, which did not say
+    craniotomy = craniotomy_of(case)
+    _, camera_from_world = overview_view(craniotomy, parenchyma_of(case, craniotomy), size_px)
+    return not np.allclose(camera_from_world, np.asarray(made_from, float), atol=1e-3)
+
+
+def _read_index(path: Path) -> tuple[dict | None, str]:
+    index = _read_object(path)
+    whole = bool(index) and isinstance(index.get("items"), list) and isinstance(index.get("settings"), dict)
+    return (index, files.sha256(path)) if whole and "done" in index else (None, "")
+
+
+def _read_object(path: Path) -> dict | None:
+    """The JSON object in a file; None where it is damaged: the stage that wrote it is then as good as not done."""
+    try:
+        content = files.read_json(path, "file of the case")
+    except InputError:
+        return None
+    return content if isinstance(content, dict) else None

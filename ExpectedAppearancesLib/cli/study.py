@@ -1,0 +1,91 @@
+"""`study CASE...`: the paper's results section."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_parser(subparsers) -> None:
+    parser = subparsers.add_parser(
+        "study",
+        help="leave-one-texture-out, number of textures, rivals and robustness, in one report",
+        description="Trains models on some textures of a case and tests them on frames of the others, whose poses are "
+        "known. Protocol strict: unseen texture and unseen poses. Protocol loto: the paper's leave-one-texture-out, "
+        "where training views repeat the poses of the test frames. Writes CASE/study/study.json and one HTML report, "
+        "its pictures inside. Interrupted, it goes on where it was; the case's own model stays as it is.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("cases", nargs="+", type=Path, metavar="CASE", help="case folders with appearances")
+    parser.add_argument(
+        "--poses",
+        nargs="+",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="poses.json with the KNOWN poses of each case's frames, their 'style' called like the texture",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the report")
+    parser.add_argument("--protocols", type=_names, default="strict,loto", metavar="A,B", help="strict, loto, or none")
+    parser.add_argument(
+        "--preset",
+        type=_names,
+        default="quick",
+        metavar="A,B",
+        help="what is trained: quick, best, paper, probseg, binseg; several are compared on the same frames",
+    )
+    parser.add_argument("--styles", type=_names, metavar="A,B", help="textures to leave out; left out: all with frames")
+    parser.add_argument(
+        "--textures-study",
+        action="store_true",
+        help="also: 3 to 12 training textures, 3 others left out, equal steps",
+    )
+    parser.add_argument("--robustness", action="store_true", help="also: error and refusals of disturbed frames")
+    parser.add_argument("--robustness-frames", type=int, default=80, metavar="N", help="frames to disturb")
+    parser.add_argument("--steps", type=int, help="steps of each training; left out: the preset's")
+    parser.add_argument("--minutes", type=float, help="longest time of each training; left out: the preset's")
+    parser.add_argument("--seed", type=int, default=0, help="seed of weights, views and choices")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
+    parser.add_argument("--appearances", choices=("surface", "image"), help="method whose appearances are used")
+    parser.add_argument(
+        "--executor",
+        default="local",
+        metavar="WHERE",
+        help="local: one training after another; dask://HOST:PORT: on the workers of that scheduler, which must see "
+        "the same folders (start them with one thread each)",
+    )
+    parser.set_defaults(run=run)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise argparse.ArgumentTypeError("names nothing; give names separated by commas")
+    return names
+
+
+def run(args: argparse.Namespace, progress) -> None:
+    from ..errors import InputError
+    from ..evaluation.study import StudySettings, run_study, study_path
+    from ..evaluation.study_report import study_text
+
+    if len(args.poses) != len(args.cases):
+        raise InputError(f"--poses: {len(args.poses)} files for {len(args.cases)} cases; give one for each, in order.")
+    settings = StudySettings(
+        protocols=() if args.protocols == ("none",) else args.protocols,
+        presets=args.preset,
+        styles=args.styles,
+        textures_study=args.textures_study,
+        robustness=args.robustness,
+        robustness_frames=args.robustness_frames,
+        steps=args.steps,
+        minutes=args.minutes,
+        seed=args.seed,
+        device=args.device,
+        method=args.appearances,
+        executor=args.executor,
+    )
+    for case, study in zip(args.cases, run_study(list(zip(args.cases, args.poses)), args.out, settings, progress)):
+        print(study_text(study))
+        print(f"Figures: {study_path(case)}")
+    print(f"Report: {args.out.absolute() / 'report.html'}")

@@ -1,0 +1,380 @@
+"""The paper's results section on a case: leave-one-texture-out, number of textures, robustness; CASE/study/study.json.
+
+Each left-out texture is tested by a model that was trained on the others:
+strict: every training view has a pose of its own, so texture and pose of a test frame are both new to the model;
+loto: the paper's form. The texture is new, the poses are not: training views repeat the poses of the test frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from .. import files
+from ..appearances.store import folder_of, read_appearances
+from ..case.case import Case
+from ..errors import InputError, Problems
+from ..executor import LOCAL, check_executor, run_jobs
+from ..geometry.camera import Camera
+from ..model.presets import PRESETS
+from ..registration.poses_file import Frame, read_poses, write_poses
+from .curves import curve_points
+from .evaluate import Evaluation, check_out, compare, known_frames, overlay_images, register_frames
+from .metrics import add_auc, add_mm
+from .overlays import choose_frames, sheet
+from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
+from .verdict import STUDY_FORMAT
+
+FORMAT_VERSION = 1
+LEFT_OUT = 3  # textures of the number-of-textures study that no model is trained on
+TEXTURE_COUNTS = range(3, 13)
+CURVE_STEP = 0.25  # mm and degrees between the points of the curves
+ProgressFunction = Callable[[float, str], None]
+TRAINING_SHARE = 0.85  # of the progress
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """What to do. styles: textures to leave out, None for all that have frames. steps, minutes: of each training; None
+    for the preset's. method: of the appearances; None for the one that is complete."""
+
+    protocols: tuple[str, ...] = PROTOCOLS
+    presets: tuple[str, ...] = ("quick",)
+    styles: tuple[str, ...] | None = None
+    textures_study: bool = False
+    robustness: bool = False
+    robustness_frames: int = 80
+    steps: int | None = None
+    minutes: float | None = None
+    seed: int = 0
+    device: str = "auto"
+    method: str | None = None
+    executor: str = LOCAL
+
+
+@dataclass(frozen=True, eq=False)
+class StudyCase:
+    """A case with frames of known pose. with_frames: its textures that have frames; styles: those to leave out."""
+
+    case: Case
+    poses_path: Path
+    camera: Camera
+    frames: list[Frame]
+    textures: list[str]
+    with_frames: list[str]
+    styles: list[str]
+    method: str
+    inputs: dict
+
+    @property
+    def folder(self) -> Path:
+        return self.case.folder / "study"
+
+
+def run_study(
+    pairs: Sequence[tuple[Path, Path]],
+    out_folder: Path,
+    settings: StudySettings,
+    progress: ProgressFunction = lambda _fraction, _message: None,
+) -> list[dict]:
+    """Study each (case folder, poses file with known poses); returns the content of each CASE/study/study.json.
+
+    Writes study.json into each case and report.html with its figures into out_folder. Killed, it goes on: a finished
+    fold is not trained again. Raises InputError with all problems before anything is trained.
+    """
+    from .study_report import write_study_report
+
+    out_folder = Path(out_folder).absolute()
+    studied = _check(pairs, out_folder, settings)
+    jobs = [job for one in studied for job in _jobs(one, settings)]
+    waiting = [job for job in jobs if not is_trained(job)]
+    for one in studied:
+        count = sum(job.case_folder == str(one.case.folder) for job in waiting)
+        files.require_space(one.folder, count * SPACE_MB["fold"] + SPACE_MB["under way"])
+    progress(0.0, f"{len(waiting)} of {len(jobs)} models are to be trained")
+    run_jobs(waiting, train_fold, settings.executor, lambda f, text: progress(TRAINING_SHARE * f, text))
+
+    results = []
+    for i, one in enumerate(studied):
+        begin, share = TRAINING_SHARE + (1 - TRAINING_SHARE) * i / len(studied), (1 - TRAINING_SHARE) / len(studied)
+        results.append(_evaluate(one, settings, lambda f, text, b=begin, s=share: progress(b + s * f, text)))
+    write_study_report(out_folder, [(one.case.folder, result) for one, result in zip(studied, results)])
+    progress(1.0, f"Report: {out_folder / 'report.html'}")
+    return results
+
+
+def study_path(case_folder: Path) -> Path:
+    return Path(case_folder) / "study" / "study.json"
+
+
+def read_study(case_folder: Path) -> dict | None:
+    """The content of a case's study.json, None where no study was made. Raises InputError when it is none."""
+    path = study_path(case_folder)
+    if not path.is_file():
+        return None
+    values = files.read_json(path, "study")
+    if (
+        not isinstance(values, dict)
+        or values.get("format") != STUDY_FORMAT
+        or not isinstance(values.get("presets"), dict)
+    ):
+        raise InputError(f"{path}: not the result of a study; run `study` again.")
+    if not isinstance(values.get("format_version"), int) or values["format_version"] > FORMAT_VERSION:
+        raise InputError(f"{path}: made by a newer version; update ExpectedAppearances, or run `study` again.")
+    return values
+
+
+def _check(pairs, out_folder: Path, settings: StudySettings) -> list[StudyCase]:
+    problems, studied = Problems(), []
+    for word, chosen, known in (("protocols", settings.protocols, PROTOCOLS), ("preset", settings.presets, PRESETS)):
+        for name in chosen:
+            if name not in known:
+                problems.add(f"--{word}: '{name}' is not known; there are {', '.join(known)}.")
+    for name, value in (("steps", settings.steps), ("minutes", settings.minutes)):
+        if value is not None and value <= 0:
+            problems.add(f"--{name}: {value}; it must be above 0.")
+    if settings.robustness_frames < 1:
+        problems.add(f"--robustness-frames: {settings.robustness_frames}; give at least 1.")
+    with problems.collect():
+        check_out(out_folder)
+    with problems.collect():
+        check_executor(settings.executor)
+    for case_folder, poses_path in pairs:
+        with problems.collect():
+            studied.append(_open(Path(case_folder), Path(poses_path).absolute(), settings))
+    problems.raise_if_any()
+    return studied
+
+
+def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
+    case = Case.open(folder)
+    problems, camera, frames = Problems(), case.camera, []
+    method, appearances = settings.method, []
+    with problems.collect():
+        camera, frames = known_frames(poses_path, None, case.camera)
+    with problems.collect():
+        method, appearances = read_appearances(case, settings.method)
+    problems.raise_if_any()
+    textures = sorted({appearance.style for appearance in appearances})
+    styles = [style for style in textures if any(frame.style == style for frame in frames)]
+    if not styles:
+        problems.add(
+            f"{poses_path}: none of its frames has a style that is called like a texture of {folder} "
+            f"({', '.join(textures)}); give each frame the name of its texture as 'style'."
+        )
+    for style in settings.styles or ():
+        if style not in styles:
+            problems.add(f"--styles: '{style}' has no frames or no appearances; there are {', '.join(styles)}.")
+    least = LEFT_OUT + TEXTURE_COUNTS[0] if settings.textures_study else 2 if settings.protocols else 1
+    if len(textures) < least:
+        problems.add(
+            f"{folder}: has appearances of {len(textures)} textures, at least {least} are needed; synthesise more."
+        )
+    if settings.textures_study and len(styles) < LEFT_OUT:
+        problems.add(f"{poses_path}: has frames of {len(styles)} textures; --textures-study tests on {LEFT_OUT}.")
+    if settings.robustness and not settings.protocols and not (case.model_folder / "model.onnx").is_file():
+        problems.add(f"{folder}: has no model to test for robustness; run `train`, or study the protocol strict too.")
+    problems.raise_if_any()
+    inputs = {
+        "vessels_sha256": case.manifest["inputs"]["vessels"]["sha256"],
+        "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
+        "poses_sha256": files.sha256(poses_path),
+        "ranges": case.manifest["stages"].get("render", {}).get("ranges"),
+    }
+    chosen = [style for style in styles if settings.styles is None or style in settings.styles]
+    return StudyCase(case, poses_path, camera, frames, textures, styles, chosen, method, inputs)
+
+
+def _jobs(one: StudyCase, settings: StudySettings) -> list[FoldJob]:
+    jobs = [
+        _job(one, settings, preset, protocol, style, (style,))
+        for preset in settings.presets
+        for protocol in settings.protocols
+        for style in one.styles
+    ]
+    if settings.textures_study:
+        for trained_on in texture_subsets(one.textures, one.with_frames, settings.seed)[1]:
+            exclude = tuple(style for style in one.textures if style not in trained_on)
+            jobs.append(_job(one, settings, settings.presets[0], "textures", f"{len(trained_on):02d}", exclude))
+    return jobs
+
+
+def _job(one: StudyCase, settings: StudySettings, preset: str, protocol: str, name: str, exclude) -> FoldJob:
+    given = {key: getattr(settings, key) for key in ("steps", "minutes") if getattr(settings, key) is not None}
+    inputs = {key: value for key, value in one.inputs.items() if key != "poses_sha256" or protocol == "loto"}
+    identity = {"preset": replace(PRESETS[preset], **given).to_dict(), "seed": settings.seed, "protocol": protocol}
+    identity |= {"exclude": list(exclude), "method": one.method, "inputs": inputs}
+    return FoldJob(
+        str(one.case.folder),
+        f"{preset}-{protocol}-{name}",
+        protocol,
+        preset,
+        tuple(exclude),
+        str(one.poses_path),
+        settings.seed,
+        settings.device,
+        one.method,
+        settings.steps,
+        settings.minutes,
+        identity,
+    )
+
+
+def texture_subsets(textures: Sequence[str], tested: Sequence[str], seed: int) -> tuple[list[str], list[list[str]]]:
+    """Three of the `tested` textures, left out of all models, and the textures of each model: 3, 4 ... of the others.
+
+    Each set holds the one before, so that models differ in nothing but the textures that were added.
+    """
+    rng = np.random.default_rng([seed, 23])
+    left_out = sorted(rng.permutation(sorted(tested)).tolist()[:LEFT_OUT])
+    others = rng.permutation(sorted(set(textures) - set(left_out))).tolist()
+    return left_out, [sorted(others[:n]) for n in TEXTURE_COUNTS if n <= len(others)]
+
+
+def _evaluate(one: StudyCase, settings: StudySettings, progress: ProgressFunction) -> dict:
+    """Fill the case's study.json, part by part, and return it."""
+    study = _begin(one, settings)
+    parts = [(preset, protocol) for preset in settings.presets for protocol in settings.protocols]
+    for i, (preset, protocol) in enumerate(parts):
+        progress(0.7 * i / len(parts), f"registering frames with the models of {preset}, {protocol}")
+        folds = {style: _job(one, settings, preset, protocol, style, (style,)) for style in one.styles}
+        evaluation = _of_folds(one, {style: (job, [style]) for style, job in folds.items()})
+        shown = _write_overlays(one, evaluation, f"{preset}-{protocol}") if preset == settings.presets[0] else None
+        entry = _figures(evaluation) | {"folds": {style: _training(job) for style, job in folds.items()}}
+        study["presets"].setdefault(preset, {})[protocol] = entry | ({"overlays": shown} if shown else {})
+        _save(one, study, settings)
+    if settings.textures_study:
+        progress(0.7, "registering frames with the models of the number-of-textures study")
+        study["textures"] = _textures_study(one, settings)
+        _save(one, study, settings)
+    if settings.robustness:
+        study["robustness"] = _robustness(one, settings, lambda f, text: progress(0.75 + 0.25 * f, text))
+        _save(one, study, settings)
+    return study
+
+
+def _begin(one: StudyCase, settings: StudySettings) -> dict:
+    """The study so far where it is about the same inputs, else a new one."""
+    try:
+        before = read_study(one.case.folder)
+    except InputError:
+        before = None
+    if before and before.get("inputs") == one.inputs:
+        return before
+    study = {
+        "format": STUDY_FORMAT,
+        "format_version": FORMAT_VERSION,
+        "case": one.case.folder.name,
+        "inputs": one.inputs,
+    }
+    distances = nearest_other_pose_add_mm(one.case.vessels.vertices_mm, [f.camera_from_world for f in one.frames])
+    study["nearest_other_pose_add_mm"] = float(np.mean(distances)) if len(distances) else None
+    return study | {"presets": {}, "preset": settings.presets[0], "protocols": {}, "thresholds": {}}
+
+
+def _save(one: StudyCase, study: dict, settings: StudySettings) -> None:
+    """The first preset's figures also stand on top: they are what a panel shows."""
+    if settings.presets[0] in study["presets"]:
+        study["preset"] = settings.presets[0]
+        protocols = study["presets"][study["preset"]]
+        study["protocols"] = {name: {k: entry[k] for k in ("per_style", "all")} for name, entry in protocols.items()}
+        study["thresholds"] = {name: entry["thresholds"] for name, entry in protocols.items()}
+    study["settings"] = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(settings).items()}
+    files.write_json(study_path(one.case.folder), study)
+
+
+def _of_folds(one: StudyCase, folds: dict[str, tuple[FoldJob, list[str]]]) -> Evaluation:
+    """All frames of the styles, each registered by the model of its fold."""
+    true, predicted = [], []
+    for job, styles in folds.values():
+        frames = [frame for frame in one.frames if frame.style in styles]
+        true += frames
+        predicted += _registered(one, job, frames)
+    return compare(one.case, one.camera, true, predicted)
+
+
+def _registered(one: StudyCase, job: FoldJob, frames: list[Frame]) -> list[Frame]:
+    """Frames as the fold's model sees them; what was registered before with the same model is read again."""
+    path, made_of = job.folder / "predicted.json", job.folder / "predicted.of.json"
+    of = {"model_sha256": files.sha256(job.folder / "model.onnx"), "poses_sha256": one.inputs["poses_sha256"]}
+    if path.is_file() and made_of.is_file() and files.read_json(made_of, "record of predictions") == of:
+        by_image = {frame.image: frame for frame in read_poses(path)[1]}
+        if all(frame.image in by_image for frame in frames):
+            return [by_image[frame.image] for frame in frames]
+    from ..registration.predictor import Predictor
+
+    predicted = register_frames(frames, one.camera, Predictor(job.folder), lambda *_: None)
+    write_poses(path, one.camera, [frame.to_dict() for frame in predicted])
+    files.write_json(made_of, of)
+    return predicted
+
+
+def _figures(evaluation: Evaluation) -> dict:
+    figures = dict(evaluation.metrics)
+    per_style = figures.pop("styles")
+    curve = curve_points(evaluation.errors, CURVE_STEP) | {"add_auc_20mm": add_auc(evaluation.errors)}
+    return {"per_style": per_style, "all": figures, "thresholds": curve}
+
+
+def _training(job: FoldJob) -> dict:
+    """Steps, time and inner validation of a fold's training."""
+    values = files.read_json(job.folder / "training.json", "record of a training")["validation"]
+    return {key: values[key] for key in ("steps", "seconds", "add_mm_mean")}
+
+
+def _textures_study(one: StudyCase, settings: StudySettings) -> dict:
+    left_out, subsets = texture_subsets(one.textures, one.with_frames, settings.seed)
+    rows = []
+    for trained_on in subsets:
+        exclude = tuple(style for style in one.textures if style not in trained_on)
+        job = _job(one, settings, settings.presets[0], "textures", f"{len(trained_on):02d}", exclude)
+        evaluation = _of_folds(one, {"": (job, left_out)})
+        row = {"textures": len(trained_on), "trained_on": trained_on, "training": _training(job)}
+        rows.append(row | {"metrics": _figures(evaluation)["all"]})
+    return {"preset": settings.presets[0], "left_out": left_out, "rows": rows}
+
+
+def _robustness(one: StudyCase, settings: StudySettings, progress: ProgressFunction) -> dict:
+    from .robustness import example_sheet, robustness_table
+
+    vertices_mm, frames = one.case.vessels.vertices_mm, [frame for frame in one.frames if frame.style in one.styles]
+    predictor_of, model = _predictor_of(one, settings)
+    count, seed = settings.robustness_frames, settings.seed
+    table = robustness_table(vertices_mm, one.camera, frames, predictor_of, model, count, seed, progress)
+    files.write_png(one.folder / "robustness.png", example_sheet(frames[0], one.camera, vertices_mm, seed))
+    return table | {"examples": "robustness.png"}
+
+
+def _predictor_of(one: StudyCase, settings: StudySettings):
+    """(style -> predictor, which model that is): the case's own model, else those of the first preset's folds."""
+    from ..registration.predictor import Predictor
+
+    if (one.case.model_folder / "model.onnx").is_file():
+        own = Predictor(one.case.model_folder)
+        return (lambda _style: own), f"the case's own model ({own.meta['preset']})"
+    preset, protocol = settings.presets[0], settings.protocols[0]
+    folders = {style: _job(one, settings, preset, protocol, style, (style,)).folder for style in one.styles}
+    predictors = {style: Predictor(folder) for style, folder in folders.items()}
+    return predictors.__getitem__, f"models of {preset}, {protocol}, that have not seen the frame's texture"
+
+
+def _write_overlays(one: StudyCase, evaluation: Evaluation, name: str) -> str:
+    """Writes CASE/study/overlays-NAME.png; returns the file's name."""
+    chosen = choose_frames(evaluation.errors.add_mm, evaluation.styles, 12)
+    files.write_png(one.folder / f"overlays-{name}.png", sheet(overlay_images(one.case, evaluation, chosen)))
+    return f"overlays-{name}.png"
+
+
+def nearest_other_pose_add_mm(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
+    """ADD (P,) of answering, for each distinct pose, the nearest other one, chosen knowing the truth: what memory of
+    poses alone could reach. Empty for fewer than two distinct poses."""
+    distinct = np.unique(np.round(np.asarray(poses, float).reshape(-1, 16), 6), axis=0).reshape(-1, 4, 4)
+    some = vertices_mm[:: max(1, len(vertices_mm) // 300)]
+    nearest = []
+    for i, pose in enumerate(distinct if len(distinct) > 1 else ()):
+        others = np.delete(distinct, i, axis=0)
+        nearest.append(add_mm(some, np.broadcast_to(pose, others.shape), others).min())
+    return np.array(nearest)

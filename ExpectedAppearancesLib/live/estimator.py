@@ -1,0 +1,100 @@
+"""The model that a session asks for poses: opened for one case, and refused for another."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from ..case.case import Case
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..registration.poses_file import read_poses
+
+if TYPE_CHECKING:
+    from ..registration.predictor import Prediction
+
+PROVIDER_NAMES = {"CUDAExecutionProvider": "GPU (CUDA)", "CPUExecutionProvider": "CPU"}
+THREADS = 2
+
+
+class Estimator(Protocol):
+    """What a session needs of a model; registration.predictor.Predictor is one."""
+
+    def predict(self, image_rgb: np.ndarray, camera: Camera | None = None) -> Prediction: ...
+
+
+@dataclass(frozen=True)
+class OpenedModel:
+    """estimator, and the device it runs on in words: 'GPU (CUDA)' or 'CPU'."""
+
+    estimator: Estimator
+    device: str
+
+
+def case_key(case: Case) -> str:
+    """What tells one patient's models from another's: SHA-256 of the vessels."""
+    return case.manifest["inputs"]["vessels"]["sha256"]
+
+
+def open_model(case: Case) -> OpenedModel:
+    """The case's model, warmed up. Raises InputError when it is missing, damaged, or was trained on other vessels."""
+    try:
+        import onnxruntime  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"onnxruntime, which runs the model, cannot be loaded ({error}); install it: the panel offers to, or give "
+            "slicer.util.pip_install('onnxruntime') in the Python console."
+        ) from error
+    from ..registration.predictor import Predictor
+
+    estimator = Predictor(case.model_folder, THREADS)
+    trained_on = estimator.meta.get("vessels_sha256")
+    if trained_on and trained_on != case_key(case):
+        raise InputError(
+            f"{case.model_folder}: this model was trained on the vessels of another case; train this case, or open "
+            "the case that the model belongs to."
+        )
+    camera = estimator.case_camera
+    # The first pass allocates and compiles: better now than with the first frame.
+    estimator.predict(np.zeros((camera.height, camera.width, 3), np.uint8))
+    return OpenedModel(estimator, device_of(estimator))
+
+
+def device_of(estimator: Estimator) -> str:
+    """Where the model runs in fact: onnxruntime falls back to the CPU when the GPU's libraries do not load."""
+    session = getattr(estimator, "_session", None)
+    providers = session.get_providers() if session is not None else []
+    return PROVIDER_NAMES.get(providers[0], providers[0]) if providers else "CPU"
+
+
+def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path, Prediction]]:
+    """Frames that were registered before, from poses.json: camera, image paths, and the prediction of each path.
+
+    Raises InputError with every problem of the file.
+    """
+    from ..registration.predictor import Prediction
+
+    camera, frames = read_poses(poses_path)
+    given = {
+        frame.image: Prediction(
+            frame.camera_from_world,
+            frame.accepted,
+            _number(frame.extra.get("confidence"), math.nan),
+            _number(frame.extra.get("latency_ms"), 0.0),
+        )
+        for frame in frames
+    }
+    missing = [frame.image for frame in frames if not frame.image.is_file()]
+    if len(missing) == len(frames):
+        raise InputError(
+            f"{poses_path}: none of its images exists, {missing[0]} for one; restore them beside the file."
+        )
+    return camera, [frame.image for frame in frames if frame.image.is_file()], given
+
+
+def _number(value, otherwise: float) -> float:
+    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else otherwise

@@ -1,0 +1,131 @@
+"""What is kept of recorded frames, and their export as poses.json with the images beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .. import files
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..geometry.pose import is_rigid
+from ..registration.poses_file import read_poses, write_poses
+
+if TYPE_CHECKING:
+    from ..registration.predictor import Prediction
+
+FORMAT = "ExpectedAppearances live frame"
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One recorded frame; time_s: since the recording began. image_rgb may be left out (None) where only the note is
+    needed. camera is that of the image, without distortion."""
+
+    time_s: float
+    name: str
+    camera: Camera
+    prediction: Prediction
+    image_rgb: np.ndarray | None = None
+
+
+def to_note(frame: RecordedFrame, case_key: str) -> str:
+    """JSON that is saved with the frame in the scene: everything but the pixels, poses in full precision."""
+    prediction = frame.prediction
+    pose = prediction.camera_from_world
+    return json.dumps(
+        {
+            "format": FORMAT,
+            "case": case_key,
+            "time_s": frame.time_s,
+            "name": frame.name,
+            "camera": frame.camera.to_dict(),
+            "camera_from_world": None if pose is None else np.asarray(pose, float).tolist(),
+            "accepted": bool(prediction.accepted),
+            "confidence": _known(prediction.confidence),
+            "latency_ms": float(prediction.latency_ms),
+        }
+    )
+
+
+def from_note(text: str) -> tuple[RecordedFrame, str]:
+    """The frame without its pixels, and the key of its case. Raises InputError for anything else."""
+    from ..registration.predictor import Prediction
+
+    try:
+        values = json.loads(text)
+        if values["format"] != FORMAT:
+            raise ValueError("another format")
+        pose = values["camera_from_world"]
+        pose = None if pose is None else np.array(pose, float)
+        if pose is not None and not is_rigid(pose):
+            raise ValueError("its pose is not rigid")
+        prediction = Prediction(
+            pose,
+            values["accepted"] is True and pose is not None,
+            math.nan if values["confidence"] is None else float(values["confidence"]),
+            float(values["latency_ms"]),
+        )
+        camera = Camera.from_dict(values["camera"], "recorded frame: camera")
+        return RecordedFrame(float(values["time_s"]), str(values["name"]), camera, prediction), str(values["case"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"recorded frame: its note cannot be read ({error}); record again.") from error
+
+
+def export_recording(folder: Path, frames: Iterable[RecordedFrame]) -> Path:
+    """Write frames/NNNNN.png and poses.json into `folder`; returns the path of poses.json, written last.
+
+    Raises InputError when there is no frame, when the camera changes (one poses.json has one camera), or on a full
+    disk.
+    """
+    from ..registration.record import frame_record
+
+    folder = Path(folder)
+    entries, camera = [], None
+    for number, frame in enumerate(frames):
+        if camera is None:
+            camera = frame.camera
+        elif frame.camera != camera:
+            raise InputError(
+                f"recording: frame {number} ({frame.name}) has another size or camera than those before it; export "
+                "the recordings from before and after the change one by one."
+            )
+        image = folder / "frames" / f"{number:05d}.png"
+        files.write_png(image, frame.image_rgb)
+        entry = frame_record(image, frame.prediction) | {"time_s": round(frame.time_s, 4), "source": frame.name}
+        entries.append(entry | {"confidence": _known(frame.prediction.confidence)})
+    if not entries:
+        raise InputError("recording: there is no frame to export; record some first.")
+    write_poses(folder / "poses.json", camera, entries)
+    return folder / "poses.json"
+
+
+def _known(confidence: float) -> float | None:
+    """JSON has no NaN: a pose whose confidence nobody gave."""
+    return float(confidence) if math.isfinite(confidence) else None
+
+
+def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray) -> Path:
+    """Add a frame with its true pose to folder/poses.json, as `evaluate` reads it; returns the path of the file.
+
+    Raises InputError when the file has another camera, or is damaged.
+    """
+    path = Path(folder) / "poses.json"
+    entries = []
+    if path.is_file():
+        camera, known = read_poses(path)
+        if camera != frame.camera:
+            raise InputError(f"{path}: holds frames of another camera or size; choose another folder.")
+        entries = [f.to_dict() for f in known]
+    number = len(entries)
+    while (image := Path(folder) / "frames" / f"{number:05d}.png").exists():
+        number += 1
+    files.write_png(image, frame.image_rgb)
+    write_poses(path, frame.camera, [*entries, {"image": image, "camera_from_world": camera_from_world}])
+    return path

@@ -1,0 +1,384 @@
+"""A live session in a scene: what the panel's buttons do. Knows MRML and no Qt; the panel calls `tick` on its timer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ..case.case import Case
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..geometry.pose import look_at
+from ..live.alignment import PoseDifference, compare, nudge_between, nudged
+from ..live.choice import Choice, SourceKind, open_source
+from ..live.estimator import OpenedModel, case_key, open_model
+from ..live.frames import LiveFrame
+from ..live.overlay import OverlayMaker
+from ..live.recording import RecordedFrame, add_truth
+from ..live.session import LiveResult, LiveSession, Update
+from ..live.trust import Sight, Verdict
+from ..poses.craniotomy import find_craniotomy
+from . import live_record
+from .live_align import Alignment, pose_of_landmarks
+from .live_scene import FRAME, LiveScene, OverlayOptions, node_of_role, remove_live_nodes
+from .live_stream import NodeFrames
+
+
+class Views(Protocol):
+    """Whoever shows a LiveScene: told after each change, in the same call, so that nothing is drawn in between."""
+
+    def follow(self, live: LiveScene, changed: bool) -> None: ...
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the panel shows. result: of the frame on the screen. device: what the model runs on, '' without one."""
+
+    verdict: Verdict
+    result: LiveResult | None = None
+    dropped: int = 0
+    device: str = ""
+    new: bool = False
+
+    @property
+    def confidence(self) -> float | None:
+        """Of the pose on the screen; None where there is none, or where its file did not say."""
+        known = self.result is not None and self.result.prediction is not None
+        return self.result.prediction.confidence if known and np.isfinite(self.result.prediction.confidence) else None
+
+    @property
+    def latency_ms(self) -> float | None:
+        return None if self.result is None or self.result.image_rgb is None else self.result.latency_ms
+
+
+IDLE = Status(Verdict(Sight.IDLE))
+
+
+class LiveController:
+    """Owns the session, its nodes in `scene`, the recording and the alignment. `close` leaves nothing behind."""
+
+    def __init__(self, scene, views: Views | None = None, clock: Callable[[], float] = time.monotonic):
+        self._scene, self._clock = scene, clock
+        self.views = views
+        self.options = OverlayOptions()
+        self.case: Case | None = None
+        self.live: LiveScene | None = None
+        self.recorder: live_record.Recorder | None = None
+        self.alignment: Alignment | None = None
+        self.truth: np.ndarray | None = None
+        self.status = IDLE
+        self.shown_in_ms = 0.0  # how long the GUI thread was held to put the last frame into the scene
+        self._session: LiveSession | None = None
+        self._stream: NodeFrames | None = None
+        self._model: OpenedModel | None = None
+        self._registers = True
+        self._overlays: OverlayMaker | None = None
+        self._replayed: tuple | None = None
+
+    @property
+    def running(self) -> bool:
+        return self._session is not None
+
+    @property
+    def frozen(self) -> bool:
+        return self._session is not None and self._session.frozen
+
+    @property
+    def result(self) -> LiveResult | None:
+        return self.status.result
+
+    @property
+    def camera(self) -> Camera | None:
+        """Of the frame on the screen."""
+        return self.live.camera if self.live else None
+
+    # ------------------------------------------------------------------------------------------------------ session
+    def open_case(self, folder: Path) -> Case:
+        """Open a case and put its models into the scene, unless it is the one that is open. Raises InputError."""
+        if self.case is None or self.case.folder != Path(folder).absolute() or self.live is None:
+            case = Case.open(folder)
+            case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now
+            if self.live is not None:
+                self.close()
+            self.case, self._overlays = case, OverlayMaker(case.vessels)
+            self.live = LiveScene(self._scene, case)
+            self.live.set_options(self.options)
+        return self.case
+
+    def restore(self, case_path: Path, camera: Camera) -> bool:
+        """Show the frame that a saved scene brought, as `camera` took it, without overlay. False where there is none.
+
+        Raises InputError for a case that cannot be opened.
+        """
+        if node_of_role(self._scene, FRAME) is None:
+            return False
+        self.open_case(case_path)
+        self.live.take_replayed(camera)
+        self._set_visible(False, changed=True)
+        return True
+
+    def start(self, choice: Choice, single: bool = False, model: OpenedModel | None = None) -> None:
+        """Begin to register what was chosen. single: hold the first frame. Raises InputError with what is wrong."""
+        self.stop()
+        opened = open_source(choice)
+        node = self._node(choice) if choice.kind is SourceKind.NODE else None
+        case = self.open_case(choice.case_path)
+        if choice.needs_model:
+            self._model = model or open_model(case)
+        self._registers = choice.needs_model
+        estimator = self._model.estimator if choice.needs_model else None
+        self._session = LiveSession(case, estimator, opened.camera, choice.frames, choice.stale_s, self._clock)
+        self._session.start(opened.source, single or opened.still)
+        if node is not None:
+            self._stream = NodeFrames(self._scene, node, self._session.push, self._clock)
+        self.tick()
+
+    def stop(self) -> None:
+        """End the session. The last frame stays, without its overlay."""
+        self.finish_alignment(keep=False)
+        self.stop_recording()
+        if self._stream is not None:
+            self._stream.close()
+        if self._session is not None:
+            self._session.stop()
+        self._stream = self._session = None
+        self.truth = None
+        self.status = IDLE
+        if self.live is not None:
+            self.live.show_truth(None, None)
+            self._set_visible(False)
+
+    def close(self) -> None:
+        """Stop, and take everything out of the scene but recordings."""
+        self.stop()
+        if self.live is not None:
+            self.live.close()
+        else:
+            remove_live_nodes(self._scene)
+        self.forget_scene()
+
+    def forget_scene(self) -> None:
+        """The scene was closed, and the nodes are gone with it."""
+        if self._stream is not None:
+            self._stream.close()
+        if self._session is not None:
+            self._session.stop()
+        self._stream = self._session = self.live = self.case = self.recorder = self.alignment = None
+        self._model = self._overlays = self._replayed = self.truth = None
+        self.status = IDLE
+
+    def freeze(self) -> None:
+        if self._session is not None:
+            self._session.freeze()
+
+    def resume(self) -> None:
+        self.finish_alignment(keep=False)
+        self._forget_truth()
+        if self._session is not None:
+            self._session.resume()
+
+    def next_frame(self) -> None:
+        """Register one more frame and hold it."""
+        self.finish_alignment(keep=False)
+        self._forget_truth()
+        if self._session is not None:
+            self._session.next_frame()
+
+    def set_stale(self, stale_s: float) -> None:
+        if self._session is not None:
+            self._session.stale_s = stale_s
+
+    def fit_views(self) -> None:
+        """Show the whole frame again."""
+        self._follow(True)
+
+    def set_options(self, options: OverlayOptions) -> None:
+        self.options = options
+        if self.live is not None:
+            self.live.set_options(options)
+            self._follow(False)
+
+    def tick(self, wait_s: float = 0.0) -> Status:
+        """Show what is new and hide what may not be shown any more. Fast: everything slow is in the session's threads.
+
+        wait_s: time to give to those threads; where the GUI holds Python's lock, they run in no other time.
+        """
+        if self._session is None:
+            return self.status
+        if self._stream is not None:
+            self._session.say_source(self._stream.look())
+        update = self._session.tick(wait_s)
+        begin = time.perf_counter()
+        changed = False
+        if update.new is not None:
+            self._forget_truth()
+            changed = self.live.show(update.new)
+        elif update.shown is not None and not self.live.intact:
+            live_record.pause_playback(self._scene)
+            changed = self.live.show(update.shown)
+        visible = update.verdict.shows_overlay
+        self.live.set_overlay_visible(visible)
+        if update.new is not None or visible != self._was_visible():
+            self._follow(changed)
+        if update.new is not None and self.recorder is not None:
+            self.recorder.add(update.new)
+        if self.alignment is not None:
+            self.show_truth(self.alignment.camera_from_world)
+        self.status = self._status(update)
+        if update.new is not None:
+            self.shown_in_ms = (time.perf_counter() - begin) * 1000
+        return self.status
+
+    # -------------------------------------------------------------------------------------------------------- truth
+    def begin_alignment(self) -> Alignment:
+        """Let the vessels be moved over the frame that is held. Raises InputError when none is held."""
+        result = self.result
+        if not self.frozen or result is None or result.image_rgb is None:
+            raise InputError("alignment: freeze a frame first, then align the vessels to it.")
+        start = self.truth
+        if start is None and result.prediction is not None:
+            start = result.prediction.camera_from_world
+        if start is None:
+            start = self._view_from_above(result.camera)
+        overlay = self._overlays.make(self.live.camera, start)
+        if overlay is not None:
+            self.live.put_plane_at(overlay.depth_mm)
+        self.alignment = Alignment(self.live, self.case, start)
+        self.show_truth(start)
+        return self.alignment
+
+    def nudge(self, shift_mm: np.ndarray, turn_deg: np.ndarray, start: np.ndarray) -> None:
+        """Move the vessels from `start` as the sliders say, in the camera's axes."""
+        if self.alignment is not None:
+            self.alignment.set_pose(nudged(start, self.case.vessels.centroid_mm, shift_mm, turn_deg))
+
+    def nudges(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the sliders would have to be for the vessels as they lie now: shift mm, turn deg."""
+        return nudge_between(start, self.alignment.camera_from_world, self.case.vessels.centroid_mm)
+
+    def align_to_landmarks(self, in_frame, on_mesh) -> float:
+        """Move the vessels to where the pairs say; returns the root mean square error, px. Raises InputError."""
+        if self.alignment is None:
+            self.begin_alignment()
+        found = pose_of_landmarks(self.live, self.case, in_frame, on_mesh)
+        self.alignment.set_pose(found.camera_from_world)
+        self.show_truth(found.camera_from_world)
+        return found.rms_px
+
+    def finish_alignment(self, keep: bool = True) -> None:
+        if self.alignment is None:
+            return
+        pose = self.alignment.finish(keep)
+        self.alignment = None
+        self.show_truth(pose if keep else None)
+        result = self.result
+        if result is not None and result.accepted and self.live is not None:
+            self.live.set_pose(result.prediction.camera_from_world)  # what was predicted is what the views follow
+
+    def show_truth(self, camera_from_world: np.ndarray | None) -> None:
+        """Draw the true outline over the frame that is held."""
+        if camera_from_world is not None and self.truth is not None and np.allclose(camera_from_world, self.truth):
+            return
+        self.truth = camera_from_world
+        overlay = None if camera_from_world is None else self._overlays.make(self.live.camera, camera_from_world)
+        self.live.show_truth(overlay, self.live.camera)
+        self._follow(False)
+
+    def difference(self) -> PoseDifference | None:
+        """Of the predicted pose of the frame on the screen from its true one."""
+        result = self.result
+        if self.truth is None or result is None or result.prediction is None:
+            return None
+        if result.prediction.camera_from_world is None:
+            return None
+        return compare(self.case.vessels.vertices_mm, self.truth, result.prediction.camera_from_world, result.camera)
+
+    def save_truth(self, folder: Path) -> Path:
+        """Add the frame with its true pose to folder/poses.json. Raises InputError."""
+        if self.truth is None:
+            raise InputError("true pose: there is none for this frame; align the vessels first.")
+        return add_truth(folder, _recorded(self.result), self.truth)
+
+    # ---------------------------------------------------------------------------------------------------- recording
+    def start_recording(self, limit_mb: float = live_record.DEFAULT_LIMIT_MB) -> None:
+        """Record from the next frame on. Raises InputError when no frame was shown yet."""
+        if self.live is None or self.live.frame is None or not self.running:
+            raise InputError("recording: start the session first.")
+        self.recorder = live_record.Recorder(self.live, limit_mb)
+
+    def stop_recording(self):
+        """The browser of what was recorded, or None."""
+        recorder, self.recorder = self.recorder, None
+        return recorder.finish() if recorder is not None else None
+
+    def replay(self, browser) -> Status:
+        """Draw the overlay of the recorded frame that `browser` is at; call it whenever it may have moved."""
+        key = (browser.GetID(), browser.GetSelectedItemNumber(), id(self.live))
+        if self.running or self.live is None or self._replayed == key:
+            return self.status
+        self._replayed = key
+        frame, recorded_key = live_record.frame_at(browser)
+        verdict = Verdict(Sight.FROZEN if frame.prediction.accepted else Sight.REFUSED)
+        if recorded_key != case_key(self.case):
+            verdict = Verdict(Sight.OTHER_CASE)
+        changed = self.live.take_replayed(frame.camera)
+        if verdict.shows_overlay:
+            pose = frame.prediction.camera_from_world
+            self.live.set_pose(pose)
+            overlay = self._overlays.make(frame.camera, pose)
+            if overlay is None:
+                verdict = Verdict(Sight.REFUSED)
+            else:
+                self.live.draw(overlay, frame.camera)
+        result = LiveResult(_frame_of(frame), recorded_key, None, frame.camera, frame.prediction)
+        self._set_visible(verdict.shows_overlay, changed)
+        self.status = Status(verdict, result)
+        return self.status
+
+    # ----------------------------------------------------------------------------------------------------- internal
+    def _node(self, choice: Choice):
+        node = self._scene.GetNodeByID(choice.node_name) or self._scene.GetFirstNodeByName(choice.node_name)
+        if node is None or not node.IsA("vtkMRMLVolumeNode"):
+            raise InputError(f"{choice.node_name}: there is no such volume in the scene; choose it again.")
+        return node
+
+    def _status(self, update: Update) -> Status:
+        device = self._model.device if self._model and self._registers else ""
+        return Status(update.verdict, update.shown, update.dropped, device, update.new is not None)
+
+    def _was_visible(self) -> bool:
+        return self.status.verdict.shows_overlay
+
+    def _set_visible(self, visible: bool, changed: bool = False) -> None:
+        self.live.set_overlay_visible(visible)
+        self._follow(changed)
+
+    def _follow(self, changed: bool) -> None:
+        if self.views is not None and self.live is not None and self.live.frame is not None:
+            self.views.follow(self.live, changed)
+
+    def _forget_truth(self) -> None:
+        self.truth = None
+        if self.live is not None:
+            self.live.show_truth(None, None)
+
+    def _view_from_above(self, camera: Camera) -> np.ndarray:
+        """A pose to begin with where none is known: straight onto the vessels, from where they fill the view."""
+        vessels = self.case.vessels
+        craniotomy = find_craniotomy(vessels, self.case.cortex, self.case.space)
+        distance_mm = 2 * vessels.radius_mm / camera.field_of_view_mm(1.0)
+        centre = craniotomy.centre_world_mm + distance_mm * craniotomy.outward_axis
+        return look_at(centre, craniotomy.centre_world_mm, craniotomy.up)
+
+
+def _recorded(result: LiveResult) -> RecordedFrame:
+    return RecordedFrame(0.0, result.frame.name, result.camera, result.prediction, result.image_rgb)
+
+
+def _frame_of(frame: RecordedFrame) -> LiveFrame:
+    return LiveFrame(np.empty((0, 0, 3), np.uint8), frame.time_s, 0, frame.name)

@@ -1,0 +1,171 @@
+"""Recording into sequences with a browser: the frame, its CameraToRAS, and a note with confidence, time and pose.
+
+All is saved with the scene by Slicer itself. Replaying puts a frame, its transform and its note back together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry.pose import camera_to_ras
+from ..live.recording import RecordedFrame, export_recording, from_note, to_note
+from ..live.session import LiveResult
+from . import scene as scenes
+from .live_scene import FRAME, ROLE_ATTRIBUTE, TRANSFORM, LiveScene, node_of_role
+from .live_stream import pixels_of
+
+NOTE = "note"
+SEQUENCE_ATTRIBUTE = ROLE_ATTRIBUTE + ".Sequence"
+BROWSER_ATTRIBUTE = "ExpectedAppearances.Recording"
+BROWSER_NAME = "Microscope recording"
+DEFAULT_LIMIT_MB = 2048
+
+
+class Recorder:
+    """Appends results to new sequences until it is full. The nodes belong to the scene; nothing is kept here."""
+
+    def __init__(self, live_scene: LiveScene, limit_mb: float = DEFAULT_LIMIT_MB):
+        self._live, self._limit_mb = live_scene, limit_mb
+        self._scene = live_scene._scene
+        self._begin_s: float | None = None
+        self.mb = 0.0
+        self.frames = 0
+        self.sequences = {}
+        note = node_of_role(self._scene, NOTE) or self._scene.AddNewNodeByClass("vtkMRMLTextNode", "Registration")
+        note.SetAttribute(ROLE_ATTRIBUTE, NOTE)
+        self._proxies = {FRAME: live_scene.frame, TRANSFORM: live_scene.transform, NOTE: note}
+        for role, proxy in self._proxies.items():
+            sequence = self._scene.AddNewNodeByClass("vtkMRMLSequenceNode", f"{BROWSER_NAME} {proxy.GetName()}")
+            sequence.SetIndexName("time")
+            sequence.SetIndexUnit("s")
+            sequence.SetIndexType(sequence.NumericIndex)
+            sequence.SetAttribute(SEQUENCE_ATTRIBUTE, role)
+            self.sequences[role] = sequence
+
+    @property
+    def full(self) -> bool:
+        return self.mb >= self._limit_mb
+
+    def add(self, result: LiveResult) -> bool:
+        """Append a result that is shown in the live scene. False when it has no picture, or the limit is reached."""
+        from ..registration.predictor import Prediction
+
+        if result.image_rgb is None or self.full:
+            return False
+        if self._begin_s is None:
+            self._begin_s = result.frame.taken_s
+        time_s = result.frame.taken_s - self._begin_s
+        index = f"{time_s:.4f}"
+        prediction = result.prediction or Prediction(None, False, 0.0, 0.0)
+        frame = RecordedFrame(
+            time_s,
+            result.frame.name,
+            result.camera,
+            Prediction(prediction.camera_from_world, result.accepted, prediction.confidence, prediction.latency_ms),
+        )
+        self._proxies[NOTE].SetText(to_note(frame, result.case_key))
+        for role, sequence in self.sequences.items():
+            sequence.SetDataNodeAtValue(self._proxies[role], index)
+        self.mb += result.image_rgb.nbytes / 2**20
+        self.frames += 1
+        return True
+
+    def finish(self):
+        """The browser, at its last frame, which is the one on the screen; None and no nodes when nothing was recorded.
+
+        Only now: a browser that is there plays into the live nodes with every frame that is added.
+        """
+        if not self.frames:
+            for node in (*self.sequences.values(), self._proxies[NOTE]):
+                self._scene.RemoveNode(node)
+            return None
+        browser = self._scene.AddNewNodeByClass("vtkMRMLSequenceBrowserNode", BROWSER_NAME)
+        browser.SetAttribute(BROWSER_ATTRIBUTE, "1")
+        browser.SetPlaybackRateFps(20.0)
+        was_modifying = browser.StartModify()
+        for role, sequence in self.sequences.items():
+            browser.AddSynchronizedSequenceNodeID(sequence.GetID())
+            browser.AddProxyNode(self._proxies[role], sequence, False)
+            browser.SetOverwriteProxyName(sequence, False)
+            browser.SetSaveChanges(sequence, False)
+        browser.SetSelectedItemNumber(self.frames - 1)
+        browser.EndModify(was_modifying)
+        return browser
+
+
+def recordings(scene) -> list:
+    """The browsers of recordings in the scene, also of one that was loaded, in the order they were made."""
+    found = scene.GetNodesByClass("vtkMRMLSequenceBrowserNode")
+    found.UnRegister(None)
+    nodes = [found.GetItemAsObject(i) for i in range(found.GetNumberOfItems())]
+    return [node for node in nodes if node.GetAttribute(BROWSER_ATTRIBUTE)]
+
+
+def pause_playback(scene) -> None:
+    """Recordings play into the nodes that a session shows its frames in: not both at once."""
+    for browser in recordings(scene):
+        if browser.GetPlaybackActive():
+            browser.SetPlaybackActive(False)
+
+
+def recorded_frames(browser, pixels: bool = True) -> Iterator[tuple[RecordedFrame, str]]:
+    """Each recorded frame and the key of its case. Raises InputError for a browser that is no recording."""
+    sequences = {role: _sequence(browser, role) for role in (FRAME, NOTE)}
+    for item in range(sequences[NOTE].GetNumberOfDataNodes()):
+        frame, key = from_note(sequences[NOTE].GetNthDataNode(item).GetText())
+        image = None
+        if pixels:
+            image = pixels_of(sequences[FRAME].GetNthDataNode(item).GetImageData())
+        yield RecordedFrame(frame.time_s, frame.name, frame.camera, frame.prediction, image), key
+
+
+def frame_at(browser) -> tuple[RecordedFrame, str]:
+    """The recorded frame that the browser is at, without pixels, and the key of its case."""
+    item = browser.GetSelectedItemNumber()
+    note = _sequence(browser, NOTE).GetNthDataNode(item)
+    if note is None:
+        raise InputError(f"{browser.GetName()}: has no frame {item}; record again.")
+    return from_note(note.GetText())
+
+
+def export(browser, folder: Path, space: str) -> Path:
+    """Write the frames, poses.json and a transform (.tfm, camera to Slicer's world) of each frame with a pose.
+
+    Returns the path of poses.json. Raises InputError when it cannot be written.
+    """
+    folder = Path(folder)
+    poses_path = export_recording(folder, (frame for frame, _key in recorded_frames(browser)))
+    for number, (frame, _key) in enumerate(recorded_frames(browser, pixels=False)):
+        pose = frame.prediction.camera_from_world
+        if pose is not None:
+            write_transform(folder / "transforms" / f"{number:05d}.tfm", camera_to_ras(pose, space))
+    return poses_path
+
+
+def write_transform(path: Path, matrix_to_ras: np.ndarray) -> None:
+    """A 4x4 to RAS as a transform file that Slicer and ITK read; whole or not at all."""
+    import slicer
+
+    from .. import files
+
+    node = slicer.vtkMRMLLinearTransformNode()
+    scenes.set_pose(node, matrix_to_ras)
+    storage = slicer.vtkMRMLTransformStorageNode()
+    with files.replacing(Path(path)) as temporary:
+        storage.SetFileName(str(temporary))
+        if not storage.WriteData(node):
+            raise InputError(f"{path}: the transform could not be written; free some space or choose another folder.")
+
+
+def _sequence(browser, role: str):
+    collection = browser.GetScene().GetNodesByClass("vtkMRMLSequenceNode")
+    collection.UnRegister(None)
+    for i in range(collection.GetNumberOfItems()):
+        node = collection.GetItemAsObject(i)
+        if node.GetAttribute(SEQUENCE_ATTRIBUTE) == role and browser.IsSynchronizedSequenceNodeID(node.GetID(), True):
+            return node
+    raise InputError(f"{browser.GetName()}: is no recording of this panel; choose one that was recorded here.")

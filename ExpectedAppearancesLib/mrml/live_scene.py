@@ -1,0 +1,393 @@
+"""The nodes of a live session: made once, then only given new pixels, points and matrices.
+
+The frame, its frustum and all that is drawn over it lie in camera mm under one transform, CameraToRAS, as scene.py
+says. A frame and its pose are always set together; what belongs to no accepted pose is hidden, not left where it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..case.case import Case
+from ..geometry.camera import Camera
+from ..geometry.pose import camera_to_ras
+from ..live.overlay import Overlay
+from ..live.session import LiveResult
+from . import scene as scenes
+
+ROLE_ATTRIBUTE = "ExpectedAppearances.Live"  # on every node of the live panel: its role
+FIRST_PLANE_MM = 200.0  # where the frame is put up before any pose says how far the vessels are
+PLANE_CHANGE = 0.1  # share by which the vessels' depth may leave the plane before the plane follows
+TRUE_RGB, PREDICTED_RGB = (0.16, 0.86, 0.24), (0.20, 0.43, 1.0)  # the paper's figure: true green, predicted blue
+FRAME, TRANSFORM, FRUSTUM = "frame", "transform", "frustum"
+OUTLINE, TRUTH, BOX, FILL, COLOURS, BACKDROP = "outline", "truth", "box", "fill", "colours", "backdrop"
+NAMES = {OUTLINE: "Predicted outline", TRUTH: "True outline", BOX: "Vessel box"}
+RGB = {OUTLINE: PREDICTED_RGB, TRUTH: TRUE_RGB, BOX: (1.0, 0.82, 0.2)}
+
+
+@dataclass(frozen=True)
+class OverlayOptions:
+    """What the user wants to see over the frame; fill_opacity 0..1."""
+
+    outline: bool = True
+    fill: bool = True
+    fill_opacity: float = 0.35
+    box: bool = False
+
+
+class LiveScene:
+    """Adds the case and the live nodes to `scene`; `close` takes them out again.
+
+    The frame and the transform of an earlier recording are used again, so that one pair of nodes is what all views,
+    recordings and outside listeners (OpenIGTLink) look at.
+    """
+
+    def __init__(self, scene, case: Case):
+        self._scene, self._case = scene, case
+        remove_live_nodes(scene, but=(FRAME, TRANSFORM))
+        self.options = OverlayOptions()
+        self.overlay_visible = False
+        self.camera: Camera | None = None
+        self.camera_to_ras = np.eye(4)
+        self.plane_mm = FIRST_PLANE_MM
+        self._view_pixel_mm = 0.0
+        self._drawn: dict[str, tuple] = {}
+        self._stamp: tuple | None = None
+        self.models = scenes.add_case_models(scene, case)
+        for name, node in self.models.items():
+            _mark(node, name)
+        self.transform = node_of_role(scene, TRANSFORM)
+        if self.transform is None:
+            self.transform = _mark(scenes.add_camera_transform(scene, self.camera_to_ras), TRANSFORM)
+        else:
+            self.camera_to_ras = matrix_of(self.transform)
+        self.frame = node_of_role(scene, FRAME)
+        self.frustum = None
+        self.lines = {role: self._add_lines(role) for role in NAMES}
+        self.fill = self._add_fill()
+        self.backdrop = None
+
+    def show(self, result: LiveResult) -> bool:
+        """Put up a frame with its pose and overlay. True when the image plane moved or the frame changed its size.
+
+        A result without a picture changes nothing but hides the overlay.
+        """
+        if result.image_rgb is None:
+            self.set_overlay_visible(False)
+            return False
+        self.follow_models()
+        changed = self._set_geometry(result.camera, result.overlay)
+        self._set_pixels(result.image_rgb, changed)
+        if result.overlay is not None:
+            self.set_pose(result.prediction.camera_from_world)
+            self.draw(result.overlay, result.camera)
+        self.set_overlay_visible(result.overlay is not None)
+        self.show_truth(None, None)
+        self._stamp = self._newest_change()
+        return changed
+
+    @property
+    def camera_to_world(self) -> np.ndarray:
+        """Camera mm to what the views show: RAS, moved as the case's models are where they hang under a transform."""
+        return matrix_of(self.transform, to_world=True)
+
+    def follow_models(self) -> None:
+        """Hang camera and frame under the transform that the user put the vessels under, if any."""
+        parent = self.models[scenes.VESSELS].GetParentTransformNode()
+        if parent is not None and parent.GetAttribute(ROLE_ATTRIBUTE):
+            return  # the handles of the alignment: then the vessels move and the camera does not
+        if self.transform.GetParentTransformNode() is not parent:
+            self.transform.SetAndObserveTransformNodeID(parent.GetID() if parent is not None else None)
+
+    @property
+    def intact(self) -> bool:
+        """Whether frame and transform are still as `show` left them: a recording plays into the same nodes."""
+        return self._stamp is None or self._stamp == self._newest_change()
+
+    def _newest_change(self) -> tuple:
+        data = self.frame.GetImageData()
+        return data.GetMTime() if data is not None else 0, self.transform.GetTransformToWorldMTime()
+
+    def take_replayed(self, camera: Camera) -> bool:
+        """The frame node was given a recorded frame of `camera`. True when the plane or the frame's size changed."""
+        from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+        matrix = vtkMatrix4x4()
+        self.frame.GetIJKToRASMatrix(matrix)
+        return self._put_plane(camera, matrix.GetElement(2, 3))
+
+    def put_plane_at(self, depth_mm: float) -> None:
+        """Put the frame that is shown at that distance from the camera."""
+        if self._put_plane(self.camera, depth_mm):
+            self._place_frame()
+
+    def set_pose(self, camera_from_world: np.ndarray) -> None:
+        self.camera_to_ras = camera_to_ras(camera_from_world, self._case.space)
+        scenes.set_pose(self.transform, self.camera_to_ras)
+        if self._stamp is not None:
+            self._stamp = self._newest_change()
+
+    def draw(self, overlay: Overlay, camera: Camera) -> None:
+        """Outline, box and fill of a pose, onto the image plane."""
+        self._draw_lines(OUTLINE, camera, overlay.outline_px, overlay.outline_lines)
+        self._draw_lines(BOX, camera, overlay.box_px, overlay.box_lines)
+        small = camera.resized(overlay.fill.shape[1], overlay.fill.shape[0])
+        was_modifying = self.fill.StartModify()
+        self.fill.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(small, self.plane_mm)))
+        _set_image(self.fill, overlay.fill[..., None])
+        self.fill.EndModify(was_modifying)
+
+    def show_truth(self, overlay: Overlay | None, camera: Camera | None) -> None:
+        """The true outline in green, for the frame that is shown; None takes it away."""
+        if overlay is not None:
+            self._draw_lines(TRUTH, camera, overlay.outline_px, overlay.outline_lines)
+        _set_visible(self.lines[TRUTH], overlay is not None)
+
+    def set_view_pixel(self, view_pixel_mm: float) -> None:
+        """Tell the size of the microscope view's pixels on the image plane; the lines are drawn anew if it changed.
+
+        Slicer draws an image half a pixel of the view to the right of, and above, models at the same place.
+        """
+        if abs(view_pixel_mm - self._view_pixel_mm) > 0.02 * view_pixel_mm:
+            self._view_pixel_mm = view_pixel_mm
+            for role, drawn in self._drawn.items():
+                self._draw_lines(role, *drawn)
+
+    def set_overlay_visible(self, visible: bool) -> None:
+        """Show or hide all that depends on the pose: outline, fill, box and frustum."""
+        self.overlay_visible = visible
+        _set_visible(self.lines[OUTLINE], visible and self.options.outline)
+        _set_visible(self.lines[BOX], visible and self.options.box)
+        if self.frustum is not None:
+            _set_visible(self.frustum, visible)
+
+    @property
+    def fill_opacity(self) -> float:
+        """Opacity for the views' label layer: 0 when the overlay is hidden or not wanted."""
+        return self.options.fill_opacity if self.overlay_visible and self.options.fill else 0.0
+
+    def set_options(self, options: OverlayOptions) -> None:
+        self.options = options
+        self.set_overlay_visible(self.overlay_visible)
+
+    def show_backdrop(self, view_id: str) -> None:
+        """Hang the frame up behind the vessels, in one 3D view: that through the camera."""
+        if self.frame is None or self.camera is None:
+            return
+        if self.backdrop is None:
+            self.backdrop = _mark(self._scene.AddNewNodeByClass("vtkMRMLModelNode", "Microscope backdrop"), BACKDROP)
+            self.backdrop.CreateDefaultDisplayNodes()
+            self.backdrop.SetAndObserveTransformNodeID(self.transform.GetID())
+            for node in (self.backdrop, self.backdrop.GetDisplayNode()):
+                node.SetSaveWithScene(False)
+            self.backdrop.SetSelectable(False)
+            display = self.backdrop.GetDisplayNode()
+            display.SetLighting(False)
+            display.SetInterpolateTexture(True)
+            display.SetTextureImageDataConnection(self.frame.GetImageDataConnection())
+            display.AddViewNodeID(view_id)
+            self._backdrop_of = None
+        if self._backdrop_of != (self.camera, self.plane_mm):
+            self._backdrop_of = (self.camera, self.plane_mm)
+            behind_mm = self.plane_mm + 3 * self._case.vessels.radius_mm
+            self.backdrop.SetAndObservePolyData(_textured_frame(self.camera, behind_mm))
+        _set_visible(self.backdrop, self.overlay_visible)
+
+    def close(self) -> None:
+        """Take the live nodes out of the scene; those that a recording plays into stay, hidden overlay aside."""
+        remove_live_nodes(self._scene)
+
+    def _set_geometry(self, camera: Camera, overlay: Overlay | None) -> bool:
+        """Put the image plane where the vessels are; it follows only large changes, so that views keep their zoom."""
+        plane_mm = self.plane_mm
+        if overlay is not None and abs(overlay.depth_mm / plane_mm - 1) > PLANE_CHANGE:
+            plane_mm = overlay.depth_mm
+        return self._put_plane(camera, plane_mm)
+
+    def _put_plane(self, camera: Camera, plane_mm: float) -> bool:
+        if camera == self.camera and abs(plane_mm - self.plane_mm) < 1e-6:
+            return False
+        self.camera, self.plane_mm = camera, plane_mm
+        if self.frustum is None:
+            self.frustum = _mark(scenes.add_frustum(self._scene, camera, plane_mm, self.transform), FRUSTUM)
+            self.frustum.SetSelectable(False)
+            self.frustum.SetSaveWithScene(False)
+        else:
+            scenes.set_frustum(self.frustum, camera, plane_mm)
+        return True
+
+    def _set_pixels(self, image_rgb: np.ndarray, changed: bool) -> None:
+        if self.frame is None:
+            self.frame = scenes.add_frame(self._scene, image_rgb, self.camera, self.plane_mm, self.transform)
+            _mark(self.frame, FRAME)
+            return
+        was_modifying = self.frame.StartModify()
+        if changed:
+            self._place_frame()
+        _set_image(self.frame, image_rgb)
+        self.frame.EndModify(was_modifying)
+
+    def _place_frame(self) -> None:
+        self.frame.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(self.camera, self.plane_mm)))
+        self.frame.SetAndObserveTransformNodeID(self.transform.GetID())
+
+    def _add_lines(self, role: str):
+        from vtkmodules.vtkCommonDataModel import vtkPolyData
+
+        node = _mark(self._scene.AddNewNodeByClass("vtkMRMLModelNode", NAMES[role]), role)
+        node.SetAndObservePolyData(vtkPolyData())
+        node.CreateDefaultDisplayNodes()
+        node.SetAndObserveTransformNodeID(self.transform.GetID())
+        node.SetSelectable(False)
+        node.SetSaveWithScene(False)  # in a saved scene nobody would judge whether it may be shown
+        display = node.GetDisplayNode()
+        display.SetSaveWithScene(False)
+        display.SetColor(*RGB[role])
+        display.SetLighting(False)
+        display.SetLineWidth(2)
+        display.SetVisibility2D(True)
+        display.SetSliceDisplayModeToProjection()  # parallel, which on the frame's own plane is the camera's view
+        display.SetSliceIntersectionThickness(3 if role == TRUTH else 2)
+        display.SetVisibility(False)
+        return node
+
+    def _draw_lines(self, role: str, camera: Camera, points_px: np.ndarray, lines: np.ndarray) -> None:
+        self._drawn[role] = (camera, points_px, lines)
+        plane = scenes.camera_from_pixel(camera, self.plane_mm)
+        plane[:2, 3] += 0.5 * self._view_pixel_mm, -0.5 * self._view_pixel_mm
+        points_mm = np.column_stack([points_px, np.zeros(len(points_px))]) @ plane[:3, :3].T + plane[:3, 3]
+        self.lines[role].SetAndObservePolyData(scenes._line_polydata(points_mm, lines))
+
+    def _add_fill(self):
+        colours = self._scene.AddNode(_colour_table())
+        node = _mark(self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "Predicted vessels"), FILL)
+        _set_image(node, np.zeros((2, 2, 1), np.uint8))
+        node.CreateDefaultDisplayNodes()
+        node.GetDisplayNode().SetAndObserveColorNodeID(colours.GetID())
+        node.SetAndObserveTransformNodeID(self.transform.GetID())
+        node.SetSelectable(False)
+        node.SetSaveWithScene(False)
+        node.GetDisplayNode().SetSaveWithScene(False)
+        return node
+
+
+def node_of_role(scene, role: str):
+    """The live node of that role, or None."""
+    return next((node for node in _nodes(scene) if node.GetAttribute(ROLE_ATTRIBUTE) == role), None)
+
+
+def is_recorded(scene, node) -> bool:
+    """Whether a sequence browser plays into the node."""
+    browsers = scene.GetNodesByClass("vtkMRMLSequenceBrowserNode")
+    browsers.UnRegister(None)
+    return any(browsers.GetItemAsObject(i).IsProxyNode(node.GetID()) for i in range(browsers.GetNumberOfItems()))
+
+
+def remove_live_nodes(scene, but: tuple[str, ...] = ()) -> None:
+    """Take the nodes with a role out of the scene, also those that a saved scene brought along.
+
+    Those that a recording plays into stay, and those of the roles in `but`.
+    """
+    for node in _nodes(scene):
+        role = node.GetAttribute(ROLE_ATTRIBUTE)
+        if not role or role in but or not scene.IsNodePresent(node) or is_recorded(scene, node):
+            continue
+        # Display nodes of a model would stay behind without it.
+        displays = (
+            [node.GetNthDisplayNode(i) for i in range(node.GetNumberOfDisplayNodes())]
+            if (node.IsA("vtkMRMLDisplayableNode"))
+            else []
+        )
+        scene.RemoveNode(node)
+        for display in displays:
+            if display is not None and scene.IsNodePresent(display):
+                scene.RemoveNode(display)
+
+
+def _nodes(scene) -> list:
+    collection = scene.GetNodes()
+    return [collection.GetItemAsObject(i) for i in range(collection.GetNumberOfItems())]
+
+
+def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
+    """4x4 of a linear transform node, to its parent or to the world."""
+    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+    matrix = vtkMatrix4x4()
+    if to_world:
+        transform_node.GetMatrixTransformToWorld(matrix)
+    else:
+        transform_node.GetMatrixTransformToParent(matrix)
+    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+
+
+def _mark(node, role: str):
+    node.SetAttribute(ROLE_ATTRIBUTE, role)
+    return node
+
+
+def _set_visible(model, visible: bool) -> None:
+    display = model.GetDisplayNode()
+    if display is not None and bool(display.GetVisibility()) != visible:
+        display.SetVisibility(visible)
+
+
+def _set_image(volume, image: np.ndarray) -> None:
+    """New pixels uint8 (H, W, C) for a volume of one slice: into its own memory where the size is the same."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+
+    height, width, components = image.shape
+    data = volume.GetImageData()
+    scalars = data.GetPointData().GetScalars() if data is not None else None
+    same = scalars is not None and data.GetDimensions() == (width, height, 1)
+    if same and scalars.GetNumberOfComponents() == components and scalars.GetDataTypeSize() == 1:
+        vtk_to_numpy(scalars).reshape(-1, components)[:] = image.reshape(-1, components)
+        scalars.Modified()
+        data.Modified()
+        return
+    data = vtkImageData()
+    data.SetDimensions(width, height, 1)
+    scalars = numpy_to_vtk(np.ascontiguousarray(image).reshape(-1, components), deep=True)
+    scalars.SetName("ImageScalars")
+    data.GetPointData().SetScalars(scalars)
+    volume.SetAndObserveImageData(data)
+
+
+def _textured_frame(camera: Camera, depth_mm: float):
+    """vtkPolyData: the frame's outer edges at that depth in camera mm, with texture coordinates."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    corners = np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
+    plane = scenes.camera_from_pixel(camera, depth_mm)
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(corners @ plane[:3, :3].T + plane[:3, 3], deep=True))
+    cells = vtkCellArray()
+    cells.InsertNextCell(4, range(4))
+    polydata = vtkPolyData()
+    polydata.SetPoints(points)
+    polydata.SetPolys(cells)
+    # Row 0 of the frame is the first row of the texture: v grows downwards, as in the frame.
+    coordinates = numpy_to_vtk(np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32), deep=True)
+    coordinates.SetName("TextureCoordinates")
+    polydata.GetPointData().SetTCoords(coordinates)
+    return polydata
+
+
+def _colour_table():
+    import slicer
+
+    table = slicer.vtkMRMLColorTableNode()
+    table.SetName("Predicted vessels colours")
+    table.SetTypeToUser()
+    table.SetHideFromEditors(True)
+    table.SetSaveWithScene(False)
+    table.SetNumberOfColors(2)
+    table.SetColor(0, "none", 0, 0, 0, 0)
+    table.SetColor(1, "vessels", *PREDICTED_RGB, 1)
+    return _mark(table, COLOURS)

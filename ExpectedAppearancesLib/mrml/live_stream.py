@@ -1,0 +1,91 @@
+"""Frames from a volume node of the scene: an OpenIGTLink stream, a sequence that plays, or any RGB or grey image."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from ..live.feed import FeedState, FeedStatus
+from ..live.frames import LiveFrame
+
+NODE_CLASSES = ("vtkMRMLVectorVolumeNode", "vtkMRMLStreamingVolumeNode", "vtkMRMLScalarVolumeNode")
+
+
+class NodeFrames:
+    """Hands on the pixels of a volume node whenever they change; finds the node again when it was removed and returns.
+
+    Call `look` now and then (it costs nothing): it notices a node that left or came back. `close` ends everything.
+    """
+
+    def __init__(self, scene, node, deliver: Callable[[LiveFrame], None], clock: Callable[[], float] = time.monotonic):
+        self._scene, self._deliver, self._clock = scene, deliver, clock
+        self._id, self._name = node.GetID(), node.GetName()
+        self._node = self._tags = None
+        self._number = 0
+        self._stamp = -1
+        self._problem = ""
+        self._attach(node)
+
+    @property
+    def status(self) -> FeedStatus:
+        if self._node is None:
+            return FeedStatus(
+                FeedState.LOST, f"The volume {self._name} is gone from the scene; frames go on when it returns."
+            )
+        return FeedStatus(FeedState.RUNNING, self._problem)
+
+    def look(self) -> FeedStatus:
+        """Attach or let go as the scene changed; returns the status."""
+        if self._node is not None and not self._scene.IsNodePresent(self._node):
+            self._detach()
+        if self._node is None:
+            node = self._scene.GetNodeByID(self._id) or self._scene.GetFirstNodeByName(self._name)
+            if node is not None and node.IsA("vtkMRMLVolumeNode"):
+                self._attach(node)
+        return self.status
+
+    def close(self) -> None:
+        self._detach()
+        self._deliver = lambda _frame: None
+
+    def _attach(self, node) -> None:
+        self._node, self._id = node, node.GetID()
+        events = [node.ImageDataModifiedEvent]
+        if hasattr(node, "FrameModifiedEvent"):
+            events.append(node.FrameModifiedEvent)
+        self._tags = [node.AddObserver(event, self._on_image) for event in events]
+        self._on_image()
+
+    def _detach(self) -> None:
+        if self._node is not None:
+            for tag in self._tags:
+                self._node.RemoveObserver(tag)
+        self._node = self._tags = None
+
+    def _on_image(self, _caller=None, _event=None) -> None:
+        if hasattr(self._node, "DecodeFrame"):
+            self._node.DecodeFrame()
+        data = self._node.GetImageData()
+        stamp = (id(data), data.GetMTime()) if data is not None else -1
+        if data is None or stamp == self._stamp:  # one change may send more than one event
+            return
+        self._stamp = stamp
+        image = pixels_of(data)
+        self._problem = "" if image is not None else f"The volume {self._name} holds no picture of one slice."
+        if image is not None:
+            self._number += 1
+            self._deliver(LiveFrame(image, self._clock(), self._number - 1, f"{self._name} {self._number - 1}"))
+
+
+def pixels_of(image_data) -> np.ndarray | None:
+    """Copy of a vtkImageData's pixels (H, W, C), row 0 first as stored; None where it holds no single slice."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    width, height, slices = image_data.GetDimensions()
+    scalars = image_data.GetPointData().GetScalars()
+    if slices != 1 or scalars is None or scalars.GetNumberOfTuples() != width * height or not width * height:
+        return None
+    # A copy: the node writes its next frame into the same memory.
+    return vtk_to_numpy(scalars).reshape(height, width, -1).copy()

@@ -1,0 +1,191 @@
+"""How the views look at a live frame: the microscope's slice, the view through its camera, and the MRI beneath it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from ..geometry.camera import Camera
+from . import scene as scenes
+from .live_scene import LiveScene
+
+MICROSCOPE, THROUGH, OVERVIEW, MRI = "Microscope", "MicroscopeCamera", "MicroscopeOverview", "MicroscopeMRI"
+DEPTH_VIEW_FRAMES = 2.5  # how many frames high the MRI's slice along the optical axis is shown
+FIRST_LAYOUT_ID = 617  # free ids are sought from here on; Slicer's own end below 100
+
+LAYOUT = f"""
+<layout type="horizontal" split="true">
+ <item splitSize="620">
+  <view class="vtkMRMLSliceNode" singletontag="{MICROSCOPE}">
+   <property name="orientation" action="default">Axial</property>
+   <property name="viewlabel" action="default">M</property>
+   <property name="viewcolor" action="default">#2E6FDB</property>
+  </view>
+ </item>
+ <item splitSize="380">
+  <layout type="vertical" split="true">
+   <item>
+    <view class="vtkMRMLViewNode" singletontag="{OVERVIEW}">
+     <property name="viewlabel" action="default">O</property>
+    </view>
+   </item>
+   <item>
+    <view class="vtkMRMLViewNode" singletontag="{THROUGH}">
+     <property name="viewlabel" action="default">C</property>
+    </view>
+   </item>
+   <item>
+    <view class="vtkMRMLSliceNode" singletontag="{MRI}">
+     <property name="orientation" action="default">Axial</property>
+     <property name="viewlabel" action="default">D</property>
+     <property name="viewcolor" action="default">#8C6BB1</property>
+    </view>
+   </item>
+  </layout>
+ </item>
+</layout>
+"""
+
+
+class LiveViews:
+    """The views of the live layout. through_view: gives view node, camera node and size (px) of the view through the
+    camera, or None while there is none; depth_node: the MRI's slice, or None."""
+
+    def __init__(self, slice_node, composite_node, through_view: Callable[[], tuple | None], depth_node=None):
+        self._slice, self._composite = slice_node, composite_node
+        self._through_view, self._depth = through_view, depth_node
+        self._fitted: tuple | None = None
+
+    def follow(self, live: LiveScene, changed: bool) -> None:
+        """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
+        size = self._slice.GetDimensions()[:2]
+        camera_to_world = live.camera_to_world
+        align_slice(self._slice, live.camera, camera_to_world, live.plane_mm)
+        if changed or self._fitted != (size, live.camera):
+            self._fitted = (size, live.camera)
+            fit_slice(self._slice, live.camera, live.plane_mm)
+        live.set_view_pixel(view_pixel_mm(self._slice))
+        show_layers(self._composite, live.frame, live.fill, live.fill_opacity)
+        visible = live.overlay_visible
+        if bool(self._slice.GetSliceVisible()) != visible:
+            self._slice.SetSliceVisible(visible)
+        if self._depth is not None and visible:
+            align_depth_slice(self._depth, camera_to_world, live.plane_mm)
+            if changed:
+                fit_slice(self._depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
+        through = self._through_view()
+        if through is not None:
+            view_node, camera_node, view_size_px = through
+            live.show_backdrop(view_node.GetID())
+            if visible:
+                aim_camera(camera_node, view_size_px, live.camera, camera_to_world, live.plane_mm)
+            else:
+                look_away(camera_node)
+
+    def leave(self) -> None:
+        """Nothing of the live frame stays in the views."""
+        self._slice.SetSliceVisible(False)
+        for put in (self._composite.SetBackgroundVolumeID, self._composite.SetLabelVolumeID):
+            put(None)
+
+
+def add_layout(layout_node) -> int:
+    """Make the layout known to Slicer once; returns its id."""
+    layout_id = FIRST_LAYOUT_ID
+    while layout_node.IsLayoutDescription(layout_id):
+        if layout_node.GetLayoutDescription(layout_id).strip() == LAYOUT.strip():
+            return layout_id
+        layout_id += 1
+    layout_node.AddLayoutDescription(layout_id, LAYOUT)
+    return layout_id
+
+
+def align_slice(slice_node, camera: Camera, camera_to_ras: np.ndarray, plane_mm: float) -> None:
+    """Lay the slice onto the image plane, upright; zoom and pan stay as they are.
+
+    Slice views sample at the corners of their pixels: with pixel (W / 2, H / 2 - 1) at the origin the frame is sharp.
+    """
+    slice_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])  # the slice's y points up, the camera's down
+    middle = [camera.width / 2, camera.height / 2 - 1, 0, 1]
+    slice_to_camera[:, 3] = scenes.camera_from_pixel(camera, plane_mm) @ middle
+    _set_slice_to_ras(slice_node, camera_to_ras @ slice_to_camera)
+
+
+def fit_slice(slice_node, camera: Camera, plane_mm: float) -> None:
+    """Zoom so that the whole frame is in view, with square pixels whatever the shape of the view."""
+    view_width, view_height = slice_node.GetDimensions()[:2]
+    width, height = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
+    mm_per_px = max(width / max(view_width, 1), height / max(view_height, 1))
+    slice_node.SetXYZOrigin(0, 0, 0)
+    slice_node.SetFieldOfView(mm_per_px * view_width, mm_per_px * view_height, mm_per_px)
+
+
+def view_pixel_mm(slice_node) -> float:
+    """Size of a pixel of the slice view, mm."""
+    return slice_node.GetFieldOfView()[0] / max(slice_node.GetDimensions()[0], 1)
+
+
+def align_depth_slice(slice_node, camera_to_ras: np.ndarray, plane_mm: float) -> None:
+    """Lay the slice along the optical axis: image right to the right, into the head downwards, centred on the frame."""
+    slice_to_camera = np.eye(4)
+    slice_to_camera[:3, 1], slice_to_camera[:3, 2] = (0, 0, -1), (0, 1, 0)
+    slice_to_camera[2, 3] = plane_mm
+    _set_slice_to_ras(slice_node, camera_to_ras @ slice_to_camera)
+
+
+def show_layers(composite_node, frame, fill, fill_opacity: float) -> None:
+    """The frame as background, the filled vessels as label layer; sets only what changed."""
+    for get, put, node in (
+        (composite_node.GetBackgroundVolumeID, composite_node.SetBackgroundVolumeID, frame),
+        (composite_node.GetLabelVolumeID, composite_node.SetLabelVolumeID, fill),
+    ):
+        wanted = node.GetID() if node is not None else None
+        if get() != wanted:
+            put(wanted)
+    if composite_node.GetLabelOpacity() != fill_opacity:
+        composite_node.SetLabelOpacity(fill_opacity)
+
+
+def aim_camera(camera_node, view_size_px: tuple[int, int], camera: Camera, camera_to_ras: np.ndarray, depth_mm: float):
+    """Make a 3D view of view_size_px (width, height) look through `camera`: the whole frame fits into the view.
+
+    The principal point becomes the window centre, which no scene saves: call this again after loading a scene and
+    whenever the size of the view changes. Pixels that are not square (fx != fy) are shown in true proportion.
+    """
+
+    width, height = max(view_size_px[0], 1), max(view_size_px[1], 1)
+    # Pixels of the view per pixel of the frame, downwards; across, fx / fy stretches pixels that are not square.
+    stretch = camera.fx / camera.fy
+    scale = min(height / camera.height, width / (camera.width / stretch))
+    position = camera_to_ras[:3, 3]
+    vtk_camera = camera_node.GetCamera()
+    was_modifying = camera_node.StartModify()
+    camera_node.SetParallelProjection(False)
+    camera_node.SetPosition(*position)
+    camera_node.SetFocalPoint(*(position + depth_mm * camera_to_ras[:3, 2]))
+    camera_node.SetViewUp(*-camera_to_ras[:3, 1])
+    camera_node.SetViewAngle(math.degrees(2 * math.atan(height / scale / (2 * camera.fy))))
+    vtk_camera.SetWindowCenter(
+        -2 * (camera.cx - (camera.width - 1) / 2) / stretch * scale / width,
+        2 * (camera.cy - (camera.height - 1) / 2) * scale / height,
+    )
+    camera_node.EndModify(was_modifying)
+    camera_node.ResetClippingRange()
+
+
+def look_away(camera_node) -> None:
+    """Turn a 3D view's camera from everything: what it showed belonged to a pose that does not hold any more."""
+    x, y, z = camera_node.GetPosition()
+    camera_node.SetFocalPoint(x, y, z + 1e5)
+    camera_node.SetPosition(x, y, z + 1e5 - 1)
+    camera_node.SetViewUp(0, 1, 0)
+
+
+def _set_slice_to_ras(slice_node, matrix: np.ndarray) -> None:
+    wanted = np.asarray(matrix, float).ravel().tolist()
+    was_modifying = slice_node.StartModify()
+    slice_node.GetSliceToRAS().DeepCopy(wanted)
+    slice_node.UpdateMatrices()
+    slice_node.EndModify(was_modifying)

@@ -1,0 +1,262 @@
+"""What planning takes from the scene (models, segments, craniotomies) and shows in it (cameras, label maps).
+
+The scene's world is RAS, mm. Nodes that the user made are read, never changed: transforms are applied to a copy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..case.meshes import Mesh
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..geometry.pose import RAS_FROM_LPS, camera_to_ras, inverse, transform
+from ..masks.labels import CLASS_NAMES
+from ..poses.craniotomy import Craniotomy, find_craniotomy
+from .scene import camera_from_pixel
+
+FRUSTUMS, LOOKED_THROUGH, MASK = "Sampled cameras", "Camera looked through", "Label map seen"
+MASK_COLOURS = "Label map colours"
+CLASS_COLOURS = ((0.0, 0.0, 0.0, 0.0), (0.90, 0.75, 0.68, 1.0), (0.82, 0.13, 0.15, 1.0))
+FRUSTUM_COLOUR, LOOKED_THROUGH_COLOUR = (0.20, 0.45, 0.75), (1.0, 0.82, 0.2)
+FRUSTUM_LENGTH = 0.18  # of the distance to the craniotomy: cameras stay recognisable and do not cover the cortex
+
+
+def world_mesh(node, segment_id: str = "", space: str = "LPS") -> Mesh:
+    """Surface of a model node, or of one segment of a segmentation node, with all its transforms applied.
+
+    space: axes of the result, 'LPS' or 'RAS', mm. Raises InputError when there is no surface.
+    """
+    if node.IsA("vtkMRMLSegmentationNode"):
+        polydata = _segment_surface(node, segment_id)
+    else:
+        polydata = node.GetPolyData()
+    if polydata is None or not polydata.GetNumberOfPoints():
+        raise InputError(f"{node.GetName()}: holds no surface; choose another model, or segment the vessels first.")
+    polydata = _in_world(node, polydata)
+    try:
+        mesh = Mesh.from_polydata(polydata)
+    except InputError as error:
+        raise InputError(f"{node.GetName()}: {error}; make the model again.") from error
+    if not len(mesh.triangles):
+        raise InputError(f"{node.GetName()}: has no triangles; choose a surface, not points or centrelines.")
+    return mesh if space == "RAS" else Mesh(transform(RAS_FROM_LPS, mesh.vertices_mm), mesh.triangles)
+
+
+def same_mesh(first: Mesh, second: Mesh, tolerance_mm: float = 1e-3) -> bool:
+    """Whether two meshes are the same up to the rounding of single precision."""
+    return (
+        first.vertices_mm.shape == second.vertices_mm.shape
+        and np.array_equal(first.triangles, second.triangles)
+        and bool(np.abs(first.vertices_mm - second.vertices_mm).max(initial=0.0) <= tolerance_mm)
+    )
+
+
+def _segment_surface(node, segment_id: str):
+    """Closed surface of a segment, in the segmentation's own coordinates; made in a copy where there is none yet."""
+    import slicer
+    import vtk
+
+    segmentation = node.GetSegmentation()
+    if not segment_id or segmentation.GetSegment(segment_id) is None:
+        raise InputError(f"{node.GetName()}: choose the segment that holds the vessels.")
+    copy = slicer.vtkSegmentation()
+    copy.SetSourceRepresentationName(segmentation.GetSourceRepresentationName())
+    copy.CopySegmentFromSegmentation(segmentation, segment_id)
+    name = slicer.vtkSegmentationConverter.GetSegmentationClosedSurfaceRepresentationName()
+    if not copy.CreateRepresentation(name):
+        raise InputError(
+            f"{node.GetName()}: no surface could be made of this segment; draw the vessels, or choose another segment."
+        )
+    surface = vtk.vtkPolyData()
+    surface.DeepCopy(copy.GetSegment(segment_id).GetRepresentation(name))
+    return surface
+
+
+def _in_world(node, polydata):
+    import vtk
+
+    if node.GetParentTransformNode() is None:
+        return polydata
+    to_world = vtk.vtkGeneralTransform()
+    node.GetParentTransformNode().GetTransformToWorld(to_world)
+    mover = vtk.vtkTransformPolyDataFilter()
+    mover.SetTransform(to_world)
+    mover.SetInputData(polydata)
+    mover.Update()
+    return mover.GetOutput()
+
+
+def craniotomy_of_markups(node, vessels: Mesh, cortex: Mesh | None, space: str) -> Craniotomy:
+    """From a point (its first control point), or a closed curve around the craniotomy.
+
+    A point keeps the fitted outward axis; a curve gives its own, the normal of the plane through it. Raises InputError
+    when nothing is placed yet, or a curve is too short to have a plane.
+    """
+    points_ras = markup_points_ras(node)
+    if not len(points_ras):
+        raise InputError(f"{node.GetName()}: holds no point yet; click on the cortex in the 3D view.")
+    points = points_ras if space == "RAS" else transform(RAS_FROM_LPS, points_ras)
+    if not node.IsA("vtkMRMLMarkupsCurveNode"):
+        return find_craniotomy(vessels, cortex, space, points[0])
+    fitted = find_craniotomy(vessels, cortex, space)
+    # Weighted by length: the points of a curve lie denser where its control points do.
+    ends = np.roll(points, -1, axis=0)
+    lengths = np.linalg.norm(ends - points, axis=1)
+    centre = np.average((points + ends) / 2, axis=0, weights=lengths) if lengths.any() else points[0]
+    if node.GetNumberOfDefinedControlPoints() < 3:
+        raise InputError(f"{node.GetName()}: has fewer than 3 points; draw the curve around the whole craniotomy.")
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    if normal @ fitted.outward_axis < 0:
+        normal = -normal
+    return find_craniotomy(vessels, cortex, space, centre, normal)
+
+
+def markup_points_ras(node) -> np.ndarray:
+    """(N, 3) points of a markups node, RAS mm: along the curve where it is one, else the placed control points."""
+    import vtk
+
+    points = vtk.vtkPoints()
+    if node.IsA("vtkMRMLMarkupsCurveNode") and node.GetCurvePointsWorld():
+        points = node.GetCurvePointsWorld()
+    else:
+        node.GetControlPointPositionsWorld(points)
+    count = min(points.GetNumberOfPoints(), 10**6)
+    # A point that follows the mouse is listed before it is placed.
+    count = count if node.GetNumberOfDefinedControlPoints() else 0
+    return np.array([points.GetPoint(i) for i in range(count)], float).reshape(-1, 3)
+
+
+def frustum_polydata(camera: Camera, poses: np.ndarray, lengths_mm: np.ndarray, space: str):
+    """One vtkPolyData in RAS mm: for each pose (N, 4, 4) four edges from the camera's centre, and the image's frame.
+
+    lengths_mm (N,): depth at which the frame of each one is drawn. An extra tick marks the image's upper side.
+    """
+    from .scene import _line_polydata
+
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    middle = (camera.width - 1) / 2
+    corners = [(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)]
+    pixels = np.array([*corners, (middle, -0.5 - 0.12 * camera.height, 0)])
+    lines = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (1, 5), (5, 2)])
+    points_mm, all_lines = [], []
+    for pose, length_mm in zip(poses, lengths_mm):
+        of_camera = np.vstack([np.zeros(3), transform(camera_from_pixel(camera, length_mm), pixels)])
+        all_lines.append(lines + 6 * len(points_mm))
+        points_mm.append(transform(camera_to_ras(pose, space), of_camera))
+    if not points_mm:
+        return _line_polydata(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
+    return _line_polydata(np.vstack(points_mm), np.vstack(all_lines))
+
+
+def frustum_lengths_mm(poses: np.ndarray, centre_world_mm: np.ndarray) -> np.ndarray:
+    """(N,) lengths at which the cameras of `poses` are drawn."""
+    return np.array([FRUSTUM_LENGTH * max(transform(pose, centre_world_mm)[2], 1.0) for pose in poses])
+
+
+def line_model(scene, node, name: str, polydata, colour, width: float = 1.0):
+    """Show `polydata` as the lines of `node`, which is made where it is None or was removed; returns the node."""
+    if node is None or not scene.IsNodePresent(node):
+        node = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
+        node.SetHideFromEditors(True)
+        node.SetSaveWithScene(False)
+        node.CreateDefaultDisplayNodes()
+        display = node.GetDisplayNode()
+        display.SetSaveWithScene(False)
+        display.SetColor(*colour)
+        display.SetLighting(False)
+        display.SetLineWidth(width)
+        display.SetVisibility2D(False)
+    node.SetAndObservePolyData(polydata)
+    return node
+
+
+def show_mask(scene, nodes: dict, labels: np.ndarray, camera: Camera, camera_from_world, plane_mm: float, space: str):
+    """Put a label map (H, W) on the plane z = plane_mm of its camera; `nodes` keeps the nodes between calls.
+
+    Returns the vtkMRMLLabelMapVolumeNode; its IJKToRAS, under the transform that `nodes` holds too, puts pixel (u, v)
+    where the ray of that pixel meets the plane.
+    """
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+
+    from .scene import _vtk_matrix
+
+    parent = nodes.get("transform")
+    if parent is None or not scene.IsNodePresent(parent):
+        parent = nodes["transform"] = _add_hidden(scene, "vtkMRMLLinearTransformNode", LOOKED_THROUGH)
+    parent.SetMatrixTransformToParent(_vtk_matrix(camera_to_ras(camera_from_world, space)))
+    volume = nodes.get("mask")
+    if volume is None or not scene.IsNodePresent(volume):
+        volume = nodes["mask"] = _add_hidden(scene, "vtkMRMLLabelMapVolumeNode", MASK)
+        volume.CreateDefaultDisplayNodes()
+        volume.GetDisplayNode().SetSaveWithScene(False)
+        volume.GetDisplayNode().SetAndObserveColorNodeID(_mask_colours(scene, nodes).GetID())
+        volume.SetAndObserveTransformNodeID(parent.GetID())
+    data = vtkImageData()
+    data.SetDimensions(labels.shape[1], labels.shape[0], 1)
+    scalars = numpy_to_vtk(np.ascontiguousarray(labels, np.int16).ravel(), deep=True)
+    scalars.SetName("ImageScalars")
+    data.GetPointData().SetScalars(scalars)
+    volume.SetIJKToRASMatrix(_vtk_matrix(camera_from_pixel(camera, plane_mm)))
+    volume.SetAndObserveImageData(data)
+    return volume
+
+
+def look_at_mask(slice_node, camera: Camera, camera_from_world, plane_mm: float, space: str) -> None:
+    """Turn a slice view to the plane on which `show_mask` puts a label map, upright, the whole map in view."""
+    from .scene import _vtk_matrix
+
+    plane_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])  # the slice's y points up, the camera's down
+    # Slice views sample at the corners of their pixels: with this pixel at the origin the map stays sharp.
+    origin = [camera.width / 2, camera.height / 2 - 1, 0, 1]
+    plane_to_camera[:, 3] = camera_from_pixel(camera, plane_mm) @ origin
+    slice_node.GetSliceToRAS().DeepCopy(_vtk_matrix(camera_to_ras(camera_from_world, space) @ plane_to_camera))
+    slice_node.UpdateMatrices()
+    width_mm, height_mm = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
+    view_width, view_height = slice_node.GetDimensions()[:2]
+    mm_per_px = max(width_mm / max(view_width, 1), height_mm / max(view_height, 1))
+    slice_node.SetFieldOfView(mm_per_px * view_width, mm_per_px * view_height, slice_node.GetFieldOfView()[2])
+
+
+def plane_through(centre_world_mm: np.ndarray, camera_from_world: np.ndarray) -> float:
+    """Depth, mm, of the plane through a point; at least 1 mm, so that a plane can always be drawn."""
+    return max(float(transform(camera_from_world, centre_world_mm)[2]), 1.0)
+
+
+def view_direction(camera_from_world: np.ndarray, craniotomy: Craniotomy) -> tuple[float, float]:
+    """Tilt of the optical axis from the outward axis, degrees, and working distance, mm, for captions."""
+    towards_camera = -np.asarray(camera_from_world)[2, :3]
+    tilt = np.degrees(np.arccos(np.clip(towards_camera @ craniotomy.outward_axis, -1, 1)))
+    centre_mm = inverse(np.asarray(camera_from_world, float))[:3, 3]
+    return float(tilt), float(np.linalg.norm(centre_mm - craniotomy.centre_world_mm))
+
+
+def remove_nodes(scene, nodes: dict) -> None:
+    """Remove what `nodes` holds from the scene, display and storage nodes included."""
+    for node in list(nodes.values()):
+        if node is not None and scene.IsNodePresent(node):
+            if node.IsA("vtkMRMLDisplayableNode"):
+                for i in reversed(range(node.GetNumberOfDisplayNodes())):
+                    display = node.GetNthDisplayNode(i)
+                    if display:
+                        scene.RemoveNode(display)
+            scene.RemoveNode(node)
+    nodes.clear()
+
+
+def _mask_colours(scene, nodes: dict):
+    table = nodes["colours"] = _add_hidden(scene, "vtkMRMLColorTableNode", MASK_COLOURS)
+    table.SetTypeToUser()
+    table.SetNumberOfColors(len(CLASS_COLOURS))
+    for value, (name, colour) in enumerate(zip(CLASS_NAMES, CLASS_COLOURS)):
+        table.SetColor(value, name, *colour)
+    return table
+
+
+def _add_hidden(scene, kind: str, name: str):
+    """A node that comes and goes with the panel: not listed for the user, not saved with the scene."""
+    node = scene.AddNewNodeByClass(kind, name)
+    node.SetHideFromEditors(True)
+    node.SetSaveWithScene(False)
+    return node

@@ -1,0 +1,332 @@
+"""What the planning panel works on, without the panel: its parameters and the scene in, steps and files out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..case.case import Case
+from ..case.meshes import Mesh
+from ..case.recorded import CaseReader
+from ..case.steps import Chosen, Recorded, Step, craniotomy_moved, plan_steps
+from ..errors import InputError, Problems
+from ..evaluation.verdict import Limits
+from ..geometry.camera import Camera, read_camera, write_camera
+from ..poses.craniotomy import Craniotomy, find_craniotomy
+from ..poses.sampling import PoseRanges, PoseSampler
+from ..textures.library import list_textures, shipped_textures_folder
+from . import planning
+
+MODELS = {"vessels": "vessel model", "cortex": "cortex model"}
+
+
+class PlanningSession:
+    """Answers of the panel, computed once for each change of what they depend on.
+
+    `parameters`, everywhere, is the panel's parameter node or anything with the same attributes.
+    """
+
+    def __init__(self) -> None:
+        self.reader = CaseReader()
+        self.texture_digests: dict[tuple, str] = {}  # (name, version of its files) -> SHA-256, or "" without OpenCV
+        self.texture_problems: dict[tuple, str] = {}
+        self._kept: dict[str, tuple] = {}
+
+    def case(self, parameters) -> Case | None:
+        return self.reader.case(parameters.casePath)[0]
+
+    def space(self, parameters) -> str:
+        case = self.case(parameters)
+        return case.space if case else "LPS"
+
+    def mesh(self, parameters, name: str) -> Mesh | None:
+        """'vessels' or 'cortex' in the case's world: of the chosen node, else the case's. Raises InputError."""
+        node = parameters.vesselsNode if name == "vessels" else parameters.cortexModel
+        case = self.case(parameters)
+        if node is None:
+            return getattr(case, name) if case and (name == "vessels" or parameters.vesselsNode is None) else None
+        segment_id = parameters.vesselsSegmentId if name == "vessels" else ""
+        space = self.space(parameters)
+        version = (node.GetID(), segment_id, space, _version_of(node, segment_id))
+        return self._once(f"mesh.{name}", version, lambda: planning.world_mesh(node, segment_id, space))
+
+    def camera(self, parameters) -> Camera:
+        """From the calibration file or the field of view. Raises InputError."""
+        if parameters.cameraSource.value == "view":
+            return Camera.from_field_of_view(
+                parameters.imageWidthPx, parameters.imageHeightPx, parameters.fieldOfViewMm, parameters.viewedAtMm
+            )
+        if not parameters.calibrationPath:
+            raise InputError("Choose a calibration file, or give the field of view.")
+        path = Path(parameters.calibrationPath)
+        version = (str(path), path.stat().st_mtime_ns if path.is_file() else None)
+        try:
+            return self._once("camera", version, lambda: read_camera(path))
+        except ImportError as error:
+            raise InputError(f"{path}: reading OpenCV's calibration needs the Python package cv2.") from error
+
+    def craniotomy(self, parameters) -> Craniotomy:
+        """As the panel says: fitted, marked by a point or curve, or as recorded in the case. Raises InputError."""
+        vessels, cortex = self._meshes(parameters)
+        space, source = self.space(parameters), parameters.craniotomySource.value
+        recorded = self._recorded_craniotomy(parameters)
+        if source == "recorded" and recorded is not None:
+            return recorded
+        if source == "marked":
+            node = parameters.craniotomyNode
+            if node is None:
+                raise InputError("Choose a point or a closed curve on the cortex, or let the craniotomy be fitted.")
+            # Moving a point does not change the node's time of modification, so its points tell.
+            placed = (node.GetNumberOfDefinedControlPoints(), planning.markup_points_ras(node).tobytes())
+            version = (_Same(vessels), _Same(cortex), node.GetID(), placed)
+            return self._once("marked", version, lambda: planning.craniotomy_of_markups(node, vessels, cortex, space))
+        version = (_Same(vessels), _Same(cortex))
+        return self._once("fitted", version, lambda: find_craniotomy(vessels, cortex, space))
+
+    def ranges(self, parameters) -> PoseRanges:
+        distance = (parameters.nearestMm, parameters.farthestMm)
+        return PoseRanges(
+            parameters.tiltMaxDeg,
+            parameters.rollMaxDeg,
+            None if parameters.distanceAuto else distance,
+            None if parameters.lateralAuto else parameters.lateralMm,
+            parameters.inViewPercent / 100,
+        )
+
+    def sampler(self, parameters) -> PoseSampler:
+        """Raises InputError with everything that is missing or impossible."""
+        problems = Problems()
+        camera = craniotomy = vessels = None
+        with problems.collect():
+            camera = self.camera(parameters)
+        with problems.collect():
+            craniotomy = self.craniotomy(parameters)
+            vessels = self.mesh(parameters, "vessels")
+        ranges = self.ranges(parameters)
+        problems.found.extend(ranges.problems())
+        problems.raise_if_any()
+        version = (_Same(vessels), _Same(craniotomy), ranges, camera, parameters.seed)
+        return self._once(
+            "sampler", version, lambda: PoseSampler(craniotomy, ranges, camera, vessels.vertices_mm, parameters.seed)
+        )
+
+    def pose_settings(self, parameters) -> dict:
+        """As `render` records them, for comparison. Raises InputError."""
+        sampler = self.sampler(parameters)
+        settings = {
+            "poses": parameters.poseCount,
+            "seed": parameters.seed,
+            "ranges": sampler.ranges.to_dict(),
+            "craniotomy": {key: np.asarray(value).tolist() for key, value in vars(sampler.craniotomy).items()},
+        }
+        return json.loads(json.dumps(settings))
+
+    def render_arguments(self, parameters) -> list[str]:
+        """Options of the command `render` for what is chosen. Raises InputError."""
+        settings = self.pose_settings(parameters)
+        ranges, craniotomy = settings["ranges"], settings["craniotomy"]
+        options = {
+            "--poses": [settings["poses"]],
+            "--seed": [settings["seed"]],
+            "--tilt-deg": [ranges["tilt_max_deg"]],
+            "--roll-deg": [ranges["roll_max_deg"]],
+            "--working-distance-mm": ranges["working_distance_mm"],
+            "--lateral-mm": [ranges["lateral_offset_mm"]],
+            "--in-view": [ranges["in_view_min"]],
+            "--point": craniotomy["centre_world_mm"],
+            "--normal": craniotomy["outward_axis"],
+        }
+        # In full and without exponents, which argparse would take for options where they are negative.
+        return [word for name, values in options.items() for word in (name, *map(_number, values))]
+
+    def textures_folder(self, parameters) -> Path:
+        return Path(parameters.texturesPath) if parameters.texturesPath else shipped_textures_folder()
+
+    def texture_files(self, parameters) -> dict[str, tuple]:
+        """Name -> (version, image path, labels path) of what lies in the folder now."""
+        found = {}
+        for name, (image, labels) in list_textures(self.textures_folder(parameters)).items():
+            versions = [(str(p), p.stat().st_mtime_ns, p.stat().st_size) for p in (image, labels) if p]
+            found[name] = ((name, *versions), image, labels)
+        return found
+
+    def changed_models(self, parameters) -> tuple[str, ...]:
+        """Which of the chosen models are no longer those of the case."""
+        case = self.case(parameters)
+        if case is None or parameters.vesselsNode is None:
+            return ()
+        changed = []
+        for name, title in MODELS.items():
+            of_case = getattr(case, name)
+            try:
+                chosen = self.mesh(parameters, name)
+            except InputError:
+                chosen = None
+            version = (_Same(chosen), _Same(of_case))
+            same = chosen is of_case or (
+                chosen is not None
+                and of_case is not None
+                and self._once(f"same.{name}", version, lambda a=chosen, b=of_case: planning.same_mesh(a, b))
+            )
+            if not same:
+                changed.append(title)
+        return tuple(changed)
+
+    def chosen(self, parameters, running: frozenset[str] = frozenset()) -> Chosen:
+        camera, camera_problem, poses, poses_problem = None, "", None, ""
+        try:
+            camera = self.camera(parameters)
+        except InputError as error:
+            camera_problem = str(error)
+        try:
+            has_vessels = self.mesh(parameters, "vessels") is not None
+            vessels_problem = ""
+        except InputError as error:
+            has_vessels, vessels_problem = False, str(error)
+        if has_vessels and camera is not None:
+            try:
+                poses = self.pose_settings(parameters)
+            except InputError as error:
+                poses_problem = str(error)
+        textures, textures_problem = self._textures(parameters)
+        return Chosen(
+            parameters.casePath,
+            has_vessels,
+            self.changed_models(parameters),
+            camera,
+            camera_problem,
+            poses,
+            poses_problem or vessels_problem,
+            textures,
+            textures_problem,
+            {"size_px": parameters.sizePx, "iterations": parameters.iterations},
+            parameters.preset.value,
+            running,
+        )
+
+    def recorded(self, parameters) -> Recorded:
+        return self.reader.recorded(parameters.casePath, parameters.method.value, self.limits(parameters))
+
+    def steps(self, parameters, running: frozenset[str] = frozenset()) -> dict[str, Step]:
+        return plan_steps(self.chosen(parameters, running), self.recorded(parameters))
+
+    def limits(self, parameters) -> Limits:
+        return Limits(
+            parameters.addLimitMm, parameters.acceptedLimitPercent / 100, parameters.accuracyLimitPercent / 100
+        )
+
+    def problems_of_new_case(self, parameters, folder: str) -> list[str]:
+        """Everything that keeps the chosen inputs from being saved as a case in `folder`, at once."""
+        problems = Problems()
+        if not folder:
+            problems.add("Case folder: choose one with New.")
+        if parameters.vesselsNode is None and self.case(parameters) is None:
+            problems.add("Vessels: choose the model, or a segmentation and its segment.")
+        for name in MODELS:
+            with problems.collect():
+                self.mesh(parameters, name)
+        with problems.collect():
+            self.camera(parameters)
+        return problems.found
+
+    def export_inputs(self, parameters, folder: Path) -> list[str]:
+        """Write meshes and camera into `folder`; returns the options of the command `new`. Raises InputError."""
+        folder.mkdir(parents=True, exist_ok=True)
+        space = self.space(parameters)
+        options = []
+        for name in MODELS:
+            mesh = self.mesh(parameters, name)
+            if mesh is not None:
+                write_plain_mesh(folder / f"{name}.vtk", mesh, space)
+                options += [f"--{name}", str(folder / f"{name}.vtk")]
+        write_camera(folder / "camera.json", self.camera(parameters))
+        return [*options, "--camera", str(folder / "camera.json"), "--space", space]
+
+    def _meshes(self, parameters) -> tuple[Mesh, Mesh | None]:
+        vessels = self.mesh(parameters, "vessels")
+        if vessels is None:
+            raise InputError("Choose the vessel model first.")
+        return vessels, self.mesh(parameters, "cortex")
+
+    def _recorded_craniotomy(self, parameters) -> Craniotomy | None:
+        case = self.case(parameters)
+        values = case.manifest["stages"].get("render", {}).get("craniotomy") if case else None
+        if not values:
+            return None
+        parts = [np.array(values[key], float) for key in ("centre_world_mm", "outward_axis", "up")]
+        return self._once("recorded", str(values), lambda: Craniotomy(*parts))
+
+    def is_fitted(self, parameters) -> bool:
+        """Whether the craniotomy recorded in the case is the one that a fit gives; True where none is recorded."""
+        recorded = self._recorded_craniotomy(parameters)
+        if recorded is None:
+            return True
+        vessels, cortex = self._meshes(parameters)
+        return not craniotomy_moved(vars(find_craniotomy(vessels, cortex, self.space(parameters))), vars(recorded))
+
+    def _textures(self, parameters) -> tuple[dict[str, str], str]:
+        folder = self.textures_folder(parameters)
+        if not folder.is_dir():
+            return {}, f"{folder}: is no longer there; choose another folder."
+        found = self.texture_files(parameters)
+        bad = [self.texture_problems[version] for version, *_ in found.values() if version in self.texture_problems]
+        return {name: self.texture_digests.get(version, "") for name, (version, *_) in found.items()}, "\n".join(bad)
+
+    def _once(self, name: str, version, make):
+        """make(), again only where `version` changed; a failure is kept like a result."""
+        kept = self._kept.get(name)
+        if kept is None or kept[0] != version:
+            try:
+                kept = (version, make(), None)
+            except InputError as error:
+                kept = (version, None, error)
+            self._kept[name] = kept
+        if kept[2] is not None:
+            raise kept[2]
+        return kept[1]
+
+
+def write_plain_mesh(path: Path, mesh: Mesh, space: str) -> None:
+    """Legacy VTK file, binary and uncompressed: written in a few milliseconds. The header names the space."""
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
+    writer = vtkPolyDataWriter()
+    writer.SetInputData(mesh.to_polydata())
+    writer.SetHeader(f"SPACE={space}")
+    writer.SetFileTypeToBinary()
+    writer.SetFileName(str(path))
+    if not writer.Write():
+        raise InputError(f"{path}: cannot be written; free some space or choose a folder you may write to.")
+
+
+def _version_of(node, segment_id: str = "") -> tuple:
+    """Changes with the node's content and with the transforms above it."""
+    parent = node.GetParentTransformNode()
+    moved = parent.GetTransformToWorldMTime() if parent else 0
+    if node.IsA("vtkMRMLSegmentationNode"):
+        segmentation = node.GetSegmentation()
+        segment = segmentation.GetSegment(segment_id) if segment_id else None
+        source = segment.GetRepresentation(segmentation.GetSourceRepresentationName()) if segment else None
+        return (source.GetMTime() if source else 0, moved)
+    if node.IsA("vtkMRMLModelNode"):
+        return (node.GetPolyData().GetMTime() if node.GetPolyData() else 0, moved)
+    raise ValueError(f"{node.GetClassName()}: neither model nor segmentation")
+
+
+class _Same:
+    """Equal to another of the very same object, which is kept alive: an id may be given to another one later."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, _Same) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+
+def _number(value) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.10f}".rstrip("0").rstrip(".")

@@ -1,0 +1,108 @@
+"""The views of the live panel inside Slicer: its own layout, banners over the pictures, and the way back."""
+
+from __future__ import annotations
+
+import slicer
+
+from ..mrml import live_views
+from ..mrml.live_banner import Banner
+from ..mrml.live_controller import Status
+from . import live_texts
+
+
+class LayoutSection:
+    """Shows the live layout while the module is open; the layout that was there before returns on `leave`."""
+
+    def __init__(self):
+        self.views: live_views.LiveViews | None = None
+        self._before: int | None = None
+        self._banners: list = []
+
+    @property
+    def active(self) -> bool:
+        return self._before is not None
+
+    def enter(self) -> live_views.LiveViews | None:
+        """Switch to the live layout; None where Slicer runs without a window."""
+        manager = slicer.app.layoutManager()
+        if manager is None:
+            return None
+        layout_node = manager.layoutLogic().GetLayoutNode()
+        layout_id = live_views.add_layout(layout_node)
+        if layout_node.GetViewArrangement() != layout_id:
+            self._before = layout_node.GetViewArrangement()
+            layout_node.SetViewArrangement(layout_id)
+        elif self._before is None:
+            self._before = slicer.vtkMRMLLayoutNode.SlicerLayoutConventionalView
+        widget = manager.sliceWidget(live_views.MICROSCOPE)
+        depth = manager.sliceWidget(live_views.MRI)
+        if widget is None or depth is None:
+            return None
+        composite = widget.sliceLogic().GetSliceCompositeNode()
+        self.views = live_views.LiveViews(widget.mrmlSliceNode(), composite, self._through, depth.mrmlSliceNode())
+        self._restrict_slice(widget.mrmlSliceNode(), manager)
+        if not self._banners:
+            for view in (widget.sliceView(), self._three_d(live_views.THROUGH).threeDView()):
+                renderer = view.renderWindow().GetRenderers().GetFirstRenderer()
+                self._banners.append((view, Banner(renderer)))
+        return self.views
+
+    def leave(self) -> None:
+        """Give the user's layout back, unless another one was chosen meanwhile."""
+        manager = slicer.app.layoutManager()
+        for _view, banner in self._banners:
+            banner.remove()
+        self._banners = []
+        if self.views is not None:
+            self.views.leave()
+        self.views = None
+        if manager is not None and self._before is not None:
+            layout_node = manager.layoutLogic().GetLayoutNode()
+            if layout_node.GetViewArrangement() == live_views.add_layout(layout_node):
+                layout_node.SetViewArrangement(self._before)
+        self._before = None
+
+    def show(self, status: Status) -> None:
+        """Say over the pictures what may be thought of them."""
+        text, rgb = live_texts.banner(status), live_texts.COLOURS[status.verdict.sight]
+        for view, banner in self._banners:
+            if banner.say(text, rgb):
+                view.scheduleRender()
+
+    def show_mri(self, volume) -> None:
+        """Put a volume into the depth view, and that view into 3D."""
+        manager = slicer.app.layoutManager()
+        widget = manager.sliceWidget(live_views.MRI) if manager is not None else None
+        if widget is None:
+            return
+        composite = widget.sliceLogic().GetSliceCompositeNode()
+        composite.SetBackgroundVolumeID(volume.GetID() if volume is not None else None)
+        composite.SetForegroundVolumeID(None)
+        composite.SetLabelVolumeID(None)
+        widget.mrmlSliceNode().SetSliceVisible(volume is not None)
+        self._restrict_slice(widget.mrmlSliceNode(), manager)
+
+    def _through(self) -> tuple | None:
+        """View node, camera node and size of the view through the camera."""
+        widget = self._three_d(live_views.THROUGH)
+        if widget is None:
+            return None
+        node = widget.mrmlViewNode()
+        camera_node = slicer.modules.cameras.logic().GetViewActiveCameraNode(node)
+        size = tuple(widget.threeDView().renderWindow().GetSize())
+        return None if camera_node is None else (node, camera_node, size)
+
+    def _restrict_slice(self, slice_node, manager) -> None:
+        """Draw a slice in the overview only: in the view through the camera the frame would hide the vessels."""
+        overview = self._three_d(live_views.OVERVIEW)
+        if overview is not None and not slice_node.GetNumberOfThreeDViewIDs():
+            slice_node.AddThreeDViewID(overview.mrmlViewNode().GetID())
+
+    @staticmethod
+    def _three_d(name: str):
+        manager = slicer.app.layoutManager()
+        for i in range(manager.threeDViewCount):
+            widget = manager.threeDWidget(i)
+            if widget.mrmlViewNode() is not None and widget.mrmlViewNode().GetSingletonTag() == name:
+                return widget
+        return None

@@ -1,0 +1,83 @@
+"""What the live panel says, and in which colour. Green means one thing only: this may be trusted."""
+
+from __future__ import annotations
+
+import math
+
+from slicer.i18n import tr as _
+
+from ..live.trust import Sight
+from ..mrml.live_controller import Status
+
+GREEN, AMBER, RED, GREY = (0.05, 0.50, 0.20), (0.72, 0.45, 0.0), (0.75, 0.08, 0.10), (0.35, 0.37, 0.40)
+COLOURS = dict.fromkeys(Sight, RED) | {
+    Sight.FOLLOWING: GREEN,
+    Sight.FROZEN: AMBER,
+    Sight.IDLE: GREY,
+    Sight.WAITING: GREY,
+}
+
+
+def headline(status: Status) -> str:
+    """A few words that can be read across the room; also drawn over the frame."""
+    verdict = status.verdict
+    texts = {
+        Sight.IDLE: _("NOT LIVE"),
+        Sight.WAITING: _("WAITING FOR A PICTURE"),
+        Sight.LOST: _("NO PICTURE: source lost"),
+        Sight.UNUSABLE: _("NO OVERLAY: frame unusable"),
+        Sight.OTHER_CASE: _("NO OVERLAY: another patient's case"),
+        Sight.FAILED: _("NO OVERLAY: registration failed"),
+        Sight.STALE: _("NO OVERLAY: frame too old"),
+        Sight.REFUSED: _("NO OVERLAY: pose refused"),
+        Sight.FROZEN: _("FROZEN: not live"),
+        Sight.FOLLOWING: _("FOLLOWING"),
+    }
+    return texts[verdict.sight]
+
+
+def detail(status: Status) -> str:
+    """What to do about it, or what it means; one or two lines."""
+    verdict = status.verdict
+    if verdict.sight is Sight.FAILED:
+        return _("{error}. Stop and start again; if it returns, send Slicer's log.").format(error=verdict.detail)
+    if verdict.detail:
+        return verdict.detail
+    if verdict.sight is Sight.FROZEN and status.result is not None and status.result.image_rgb is None:
+        return _("A recorded frame, with the pose that it had.")
+    texts = {
+        Sight.IDLE: _("Choose a case and a source, then press Start."),
+        Sight.WAITING: _("Started; no frame has come yet."),
+        Sight.LOST: _("The source gives no frames; it is tried again every second."),
+        Sight.OTHER_CASE: _("These frames were registered to the vessels of another case. Open that case."),
+        Sight.STALE: _("No new frame has come in time. The picture on the screen is not the present."),
+        Sight.REFUSED: _("The vessels were not found with enough confidence. Clear the view, or focus again."),
+        Sight.FROZEN: _("The overlay belongs to this frame. Press Freeze again to go on."),
+        Sight.FOLLOWING: _("The overlay belongs to the newest frame. Not for clinical use."),
+    }
+    return texts.get(verdict.sight, "")
+
+
+def banner(status: Status) -> str:
+    """Over the frame: the headline, with the number that stands behind it."""
+    text = headline(status)
+    if status.verdict.sight is Sight.FOLLOWING and status.confidence is not None:
+        return _("{headline}  {percent} %").format(headline=text, percent=round(100 * status.confidence))
+    if status.verdict.sight is Sight.STALE and math.isfinite(status.verdict.age_s):
+        return _("{headline} ({age})").format(headline=text, age=age(status.verdict.age_s))
+    return text
+
+
+def age(seconds: float) -> str:
+    """A duration: ms below a second, then s, then minutes."""
+    if not math.isfinite(seconds):
+        return "–"
+    if seconds < 1:
+        return _("{ms} ms").format(ms=round(seconds * 1000))
+    if seconds < 120:
+        return _("{s} s").format(s=f"{seconds:.1f}")
+    return _("{min} min").format(min=round(seconds / 60))
+
+
+def css(rgb: tuple[float, float, float]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*(round(255 * value) for value in rgb))

@@ -1,0 +1,107 @@
+"""Section Expected appearances: made in a process of its own, the newest one shown as it is made."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import qt
+from slicer.i18n import tr as _
+
+from ..case.steps import StepState
+from ..gpus import device_arguments
+from ..textures.library import LABELS_SUFFIX
+from .planning_run import RunControls, started
+from .planning_section import Section
+
+NEWEST_PX = 220
+CONTACT_SHEET = "contact_sheet.png"  # lies beside them
+
+
+class AppearancesSection(Section):
+    name = "appearances"
+    title = "Expected appearances"
+
+    def setup(self) -> None:
+        ui = self.ui
+        self._shown: tuple | None = None
+        self._method: str | None = None
+        self.controls = RunControls(
+            self.panel.runs["synthesize"],
+            ui.appearancesStart,
+            ui.appearancesCancel,
+            ui.appearancesProgress,
+            ui.appearancesLine,
+            _("Make images of what the cortex could look like in the operating room."),
+        )
+        ui.appearancesStart.connect("clicked(bool)", lambda _checked=False: self.on_start())
+        ui.appearancesCancel.connect("clicked(bool)", lambda _checked=False: self.controls.watch.cancel())
+        ui.methodCombo.connect("currentIndexChanged(int)", self.on_method)
+
+    def refresh(self) -> None:
+        p = self.parameters
+        step = self.step
+        problem = ""
+        if step.state is StepState.MISSING:
+            problem = step.text
+        for name in ("poses", "textures"):
+            before = self.panel.steps[name]
+            if before.state in (StepState.STALE, StepState.MISSING):
+                problem = problem or before.text
+        problem = problem or self.panel.help.reason("training")
+        if self.panel.runs["train"].active:
+            problem = _("The model is being trained; cancel that first.")
+        index = self.panel.recorded.index
+        self.controls.refresh(problem, unfinished=bool(index and not index["done"]))
+        self._show_newest(p)
+
+    def close(self) -> None:
+        self._shown = None
+
+    def on_method(self, _index: int) -> None:
+        """Each method has a size at which it works well."""
+        p = self.parameters
+        if p is None or self.panel.loading or self._method == p.method.value:
+            return
+        usual = {"surface": 384, "image": 256}
+        if self._method is not None and p.sizePx == usual.get(self._method):
+            p.sizePx = usual[p.method.value]
+        self._method = p.method.value
+
+    def on_start(self) -> None:
+        started(self.panel, self.controls.watch, *self.arguments())
+
+    def arguments(self) -> tuple[list[str], dict[str, str]]:
+        """Options of the command `synthesize`, and what its environment needs."""
+        p = self.parameters
+        device, environment = device_arguments(p.device)
+        options = ["--textures", str(self.session.textures_folder(p)), "--method", p.method.value]
+        return [*options, "--size", str(p.sizePx), "--iterations", str(p.iterations), *device], environment
+
+    def _show_newest(self, p) -> None:
+        """The image that was finished last; files appear whole."""
+        case = self.session.case(p)
+        path, count = newest_image(case.appearances_folder / p.method.value) if case else (None, 0)
+        self.ui.newestImage.visible = path is not None
+        if path is None or (path, count) == self._shown:
+            return
+        self._shown = (path, count)
+        picture = qt.QPixmap(path)
+        if picture.isNull():
+            return
+        self.ui.newestImage.setPixmap(
+            picture.scaled(NEWEST_PX, NEWEST_PX, qt.Qt.KeepAspectRatio, qt.Qt.SmoothTransformation)
+        )
+        self.ui.newestImage.toolTip = _("{name}, the newest of {count}").format(name=Path(path).name, count=count)
+
+
+def newest_image(folder: Path) -> tuple[str | None, int]:
+    """Path of the appearance that was written last, and how many there are."""
+    try:
+        with os.scandir(folder) as entries:
+            images = [entry for entry in entries if entry.name.endswith(".png") and entry.name[0] != "."]
+            images = [e for e in images if not e.name.endswith(LABELS_SUFFIX) and e.name != CONTACT_SHEET]
+            newest = max(images, key=lambda entry: entry.stat().st_mtime_ns, default=None)
+            return (newest.path if newest else None), len(images)
+    except OSError:
+        return None, 0

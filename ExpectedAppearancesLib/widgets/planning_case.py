@@ -1,0 +1,247 @@
+"""Sections Case and Microscope: what a case is made of, and saving it."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import qt
+import slicer
+from slicer.i18n import tr as _
+
+from ..case.case import MANIFEST_NAME
+from ..case.steps import StepState
+from ..errors import InputError
+from .planning_qt import Child, allow, library_command, problems_in, quiet
+from .planning_section import NodeWatch, Section, changed
+
+# Of models, segmentations and the transforms above them.
+NODE_EVENTS = ("ModifiedEvent", slicer.vtkMRMLTransformableNode.TransformModifiedEvent)
+EXPORTED = {"vessels.vtk": "Vessel model", "cortex.vtk": "Cortex model", "camera.json": "Microscope"}
+OWN_TEXTURES = "textures"  # photographs added to this case
+SAVE_HINT = "Check models and microscope, and write them into the case folder."
+
+
+class CaseSection(Section):
+    name = "case"
+    title = "Case"
+
+    def setup(self) -> None:
+        self._saving: Child | None = None
+        self._watches = {name: NodeWatch(self.panel.refresh_soon) for name in ("vesselsNode", "cortexModel")}
+        self.ui.vesselsSelector.connect("currentNodeChanged(vtkMRMLNode*)", self.on_vessels)
+        self.ui.segmentSelector.connect("currentIndexChanged(int)", self.on_segment)
+        self.ui.mriSelector.connect("currentNodeChanged(vtkMRMLNode*)", self.on_mri)
+        self.ui.newCaseButton.connect("clicked(bool)", lambda _checked=False: self.on_new())
+        self.ui.openCaseButton.connect("clicked(bool)", lambda _checked=False: self.on_open())
+        for button in (self.ui.saveCaseButton, self.ui.saveMicroscopeButton):
+            button.connect("clicked(bool)", lambda _checked=False: self.save())
+
+    def refresh(self) -> None:
+        p = self.parameters
+        with quiet(self.ui.vesselsSelector):
+            self.ui.vesselsSelector.setCurrentNode(p.vesselsNode)
+        self._show_segments(p)
+        for name, watch in self._watches.items():
+            watch.watch(getattr(p, name), *NODE_EVENTS)
+        folder = p.casePath
+        self.ui.caseFolderLabel.text = Path(folder).name if folder else _("none")
+        self.ui.caseFolderLabel.toolTip = folder
+        reason = ""
+        if self._saving:
+            reason = _("The case is being saved.")
+        elif self.step.state is StepState.DONE and self.panel.steps["microscope"].state is StepState.DONE:
+            reason = _("The case is saved; nothing has changed since.")
+        elif self.panel.busy():
+            reason = _("A run is going on in this case; wait until it has ended, or cancel it.")
+        elif not folder:
+            reason = _("Choose a folder for the case with New.")
+        elif p.vesselsNode is None and self.session.case(p) is None:
+            reason = _("Choose the vessel model first.")
+        for button in (self.ui.saveCaseButton, self.ui.saveMicroscopeButton):
+            allow(button, reason, _(SAVE_HINT))
+
+    def close(self) -> None:
+        for watch in self._watches.values():
+            watch.watch(None)
+        if self._saving:
+            self._saving.stop()
+            self._saving = None
+
+    def _show_segments(self, p) -> None:
+        node = p.vesselsNode
+        is_segmentation = node is not None and node.IsA("vtkMRMLSegmentationNode")
+        self.ui.segmentSelector.visible = is_segmentation
+        self.ui.segmentLabel.visible = is_segmentation
+        if not is_segmentation:
+            return
+        segmentation = node.GetSegmentation()
+        ids = [segmentation.GetNthSegmentID(i) for i in range(segmentation.GetNumberOfSegments())]
+        names = [segmentation.GetSegment(i).GetName() for i in ids]
+        selector = self.ui.segmentSelector
+        with quiet(selector):
+            if [selector.itemText(i) for i in range(selector.count)] != names:
+                selector.clear()
+                selector.addItems(names)
+            selector.currentIndex = ids.index(p.vesselsSegmentId) if p.vesselsSegmentId in ids else -1
+
+    def on_vessels(self, node) -> None:
+        p = self.parameters
+        if not changed(p, "vesselsNode", node):
+            return
+        if node is not None and node.IsA("vtkMRMLSegmentationNode"):
+            segmentation = node.GetSegmentation()
+            ids = [segmentation.GetNthSegmentID(i) for i in range(segmentation.GetNumberOfSegments())]
+            if p.vesselsSegmentId not in ids:
+                named = [i for i in ids if "vessel" in segmentation.GetSegment(i).GetName().lower()]
+                changed(p, "vesselsSegmentId", (named or ids or [""])[0])
+
+    def on_segment(self, index: int) -> None:
+        p = self.parameters
+        node = p.vesselsNode if p else None
+        if node is not None and node.IsA("vtkMRMLSegmentationNode") and index >= 0:
+            changed(p, "vesselsSegmentId", node.GetSegmentation().GetNthSegmentID(index))
+
+    def on_mri(self, node) -> None:
+        if node is not None and self.parameters is not None and not self.panel.loading:
+            slicer.util.setSliceViewerLayers(background=node)
+
+    def on_new(self, folder: str = "") -> None:
+        """Choose where the case will be; it is written when it is saved."""
+        if not folder:
+            start = str(Path(self.parameters.casePath).parent) if self.parameters.casePath else str(Path.home())
+            folder = qt.QFileDialog.getSaveFileName(
+                slicer.util.mainWindow(), _("Folder of the new case"), str(Path(start) / _("New case"))
+            )
+        if folder:
+            self.panel.open_folder(folder)
+
+    def on_open(self, folder: str = "") -> None:
+        if not folder:
+            start = str(Path(self.parameters.casePath).parent) if self.parameters.casePath else str(Path.home())
+            folder = qt.QFileDialog.getExistingDirectory(slicer.util.mainWindow(), _("Open a case"), start)
+        if not folder:
+            return
+        if not (Path(folder) / MANIFEST_NAME).is_file():
+            slicer.util.errorDisplay(
+                _(
+                    "{folder} is not the folder of a case: it holds no {name}. Choose another, or make one with New."
+                ).format(folder=folder, name=MANIFEST_NAME)
+            )
+            return
+        self.panel.open_folder(folder, take_over=True)
+
+    def save(self) -> None:
+        """Write the case, in a process of its own. A case that is there already is kept under another name."""
+        p = self.parameters
+        problems = self.session.problems_of_new_case(p, p.casePath)
+        if problems:
+            self._tell(problems)
+            return
+        folder = Path(p.casePath)
+        if (folder / MANIFEST_NAME).is_file() and not slicer.util.confirmOkCancelDisplay(
+            _(
+                "Models or microscope differ from those of the saved case, so all that was made from it has to be made "
+                "again.\n\nThe case is saved anew; the old one is kept beside it, as {name}."
+            ).format(name=_kept_name(folder).name)
+        ):
+            return
+        exported = Path(tempfile.mkdtemp(prefix="expected-appearances-"))
+        try:
+            options = self.session.export_inputs(p, exported)
+        except InputError as error:
+            shutil.rmtree(exported, ignore_errors=True)
+            self._tell(error.problems)
+            return
+        # Made beside the old case and put in its place when it is whole.
+        made = folder
+        if (folder / MANIFEST_NAME).is_file():
+            made = folder.with_name(f".{folder.name}.new")
+            shutil.rmtree(made, ignore_errors=True)
+        command, environment = library_command("ExpectedAppearancesLib", "new", str(made), *options)
+
+        def done(code: int, output: str) -> None:
+            self._saving = None
+            shutil.rmtree(exported, ignore_errors=True)
+            for name, title in EXPORTED.items():  # the user knows the nodes, not the files in between
+                output = output.replace(str(exported / name), _(title))
+            if code:
+                self._tell(problems_in(output))
+            else:
+                self._put_in_place(made, folder)
+            self.panel.refresh_soon()
+
+        self._saving = Child(command, done, environment)
+        self.panel.refresh_soon()
+
+    @property
+    def saving(self) -> bool:
+        return self._saving is not None
+
+    def _put_in_place(self, made: Path, folder: Path) -> None:
+        try:
+            if made != folder:
+                kept = _kept_name(folder)
+                folder.rename(kept)
+                made.rename(folder)
+                if (kept / OWN_TEXTURES).is_dir():
+                    shutil.copytree(kept / OWN_TEXTURES, folder / OWN_TEXTURES)
+        except OSError as error:
+            self._tell(
+                [
+                    _("{folder}: could not be replaced ({error}); close what uses it, and save again.").format(
+                        folder=folder, error=error
+                    )
+                ]
+            )
+            return
+        self.panel.open_folder(str(folder))
+
+    def _tell(self, problems: list[str]) -> None:
+        slicer.util.errorDisplay(
+            _("The case is not saved yet:") + "\n\n" + "\n\n".join(problems), windowTitle=_("Case")
+        )
+
+
+class MicroscopeSection(Section):
+    name = "microscope"
+    title = "Microscope"
+
+    def setup(self) -> None:
+        self.ui.calibrationPathEdit.connect("currentPathChanged(QString)", self.on_path)
+
+    def refresh(self) -> None:
+        p = self.parameters
+        from_file = p.cameraSource.value == "file"
+        self.ui.calibrationRow.visible = from_file
+        self.ui.viewRow.visible = not from_file
+        if self.ui.calibrationPathEdit.currentPath != p.calibrationPath:
+            with quiet(self.ui.calibrationPathEdit):
+                self.ui.calibrationPathEdit.currentPath = p.calibrationPath
+        try:
+            camera = self.session.camera(p)
+        except InputError:
+            self.ui.microscopeSummary.visible = False
+            return
+        at_mm = p.viewedAtMm if not from_file else 300.0
+        lens = _(", lens distortion corrected") if camera.is_distorted else ""
+        self.ui.microscopeSummary.text = _(
+            "{width} × {height} px; sees {wide:.0f} × {high:.0f} mm at {at:.0f} mm{lens}"
+        ).format(
+            width=camera.width,
+            height=camera.height,
+            wide=at_mm * camera.width / camera.fx,
+            high=at_mm * camera.height / camera.fy,
+            at=at_mm,
+            lens=lens,
+        )
+        self.ui.microscopeSummary.visible = True
+
+    def on_path(self, _path=None) -> None:
+        changed(self.parameters, "calibrationPath", self.ui.calibrationPathEdit.currentPath)
+
+
+def _kept_name(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name} until {time.strftime('%Y-%m-%d %H.%M')}")

@@ -1,0 +1,209 @@
+"""The planning panel: its sections, what they share, and what becomes of it all when something is closed."""
+
+from __future__ import annotations
+
+import html
+import logging
+from collections.abc import Callable
+
+import qt
+import slicer
+from slicer.i18n import tr as _
+
+from ..case.recorded import Recorded
+from ..case.steps import STEPS, Step, StepState, next_step
+from ..mrml.planning_adopt import adopt
+from ..mrml.planning_session import PlanningSession
+from ..runs.closing import OnClose, close_runs, going_on, question
+from ..runs.state import RunState, RunStatus
+from .planning_appearances import AppearancesSection
+from .planning_case import CaseSection, MicroscopeSection
+from .planning_help import HelpSection
+from .planning_poses import PosesSection
+from .planning_qt import quiet, single_shot
+from .planning_run import RunWatch
+from .planning_textures import TexturesSection
+from .planning_training import TrainingSection
+from .planning_validation import ValidationSection
+
+REFRESH_MS = 30
+SECTIONS = (
+    CaseSection,
+    MicroscopeSection,
+    PosesSection,
+    TexturesSection,
+    AppearancesSection,
+    TrainingSection,
+    ValidationSection,
+)
+SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training"}
+
+
+class PlanningPanel:
+    """ui: the widgets of the .ui by name. session: what is worked on. scene: Slicer's."""
+
+    def __init__(self, ui, session: PlanningSession, scene):
+        self.ui, self.session, self.scene = ui, session, scene
+        self.parameters = None
+        self.entered = self.loading = False
+        self.steps: dict[str, Step] = {name: Step(StepState.MISSING, "") for name in STEPS}
+        self.recorded = Recorded()
+        self._followed: str | None = None
+        self._next = ""
+        self._timer = single_shot(REFRESH_MS, self.refresh)
+        self._ending: list = []  # runs of a closed scene that are being ended
+        self._ending_timer = qt.QTimer()
+        self._ending_timer.setInterval(500)
+        self._ending_timer.connect("timeout()", self._poll_ending)
+        self.runs = {kind: RunWatch(kind, lambda status, k=kind: self._on_run(k, status)) for kind in SECTION_OF_KIND}
+        self.help = HelpSection(self)
+        self.sections = {section.name: section(self) for section in SECTIONS}
+
+    def set_parameters(self, parameters, connect: Callable[[], None]) -> None:
+        """Show these parameters, or none; `connect` binds them to the widgets, which must not answer meanwhile."""
+        self.parameters = parameters
+        if parameters is None:
+            self._timer.stop()
+            return
+        self.loading = True
+        try:
+            with quiet(self.ui.vesselsSelector, self.ui.craniotomySelector):
+                connect()
+        finally:
+            self.loading = False
+        self.refresh_soon()
+
+    def enter(self) -> None:
+        self.entered = True
+        self.sections["training"].enter()
+        self.help.enter()
+        self.refresh()
+        self.unfold(self._next)
+
+    def exit(self) -> None:
+        self.entered = False
+        for section in self.sections.values():
+            section.leave()
+
+    def cleanup(self) -> None:
+        """The widget is destroyed: runs go on and are found again by the next panel."""
+        self.exit()
+        self._timer.stop()
+        self._ending_timer.stop()
+        for watch in self.runs.values():
+            watch.forget()
+        for section in self.sections.values():
+            section.close()
+        self.help.close()
+
+    def refresh_soon(self) -> None:
+        """Refresh once after a burst of changes."""
+        if self.parameters is not None:
+            self._timer.start()
+
+    def refresh(self) -> None:
+        """Work out the steps and show them. Everything in here is cheap, or kept from the last time."""
+        self._timer.stop()
+        if self.parameters is None:
+            return
+        if self._followed != self.parameters.casePath:
+            self._followed = self.parameters.casePath
+            for watch in self.runs.values():
+                watch.follow(self._followed)
+        if not self.entered:
+            return
+        self.steps = self.session.steps(self.parameters, self.running())
+        self.recorded = self.session.recorded(self.parameters)
+        for section in self.sections.values():
+            section.refresh()
+            section.show_step()
+        self.help.refresh()
+        self._show_next()
+
+    def running(self) -> frozenset[str]:
+        return frozenset(kind for kind, watch in self.runs.items() if watch.active)
+
+    def busy(self) -> bool:
+        """Whether something works on the case, which must then not be replaced."""
+        return bool(self.running()) or self.sections["case"].saving
+
+    def open_folder(self, folder: str, take_over: bool = False) -> None:
+        """Make `folder` the case; with take_over its models and settings replace what is chosen."""
+        self.parameters.casePath = folder
+        if take_over:
+            self.loading = True
+            try:
+                with slicer.util.tryWithErrorDisplay(_("The case could not be opened."), waitCursor=True):
+                    if adopt(self.session, self.parameters, self.scene) is None:
+                        slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
+                    elif slicer.app.layoutManager():
+                        slicer.util.resetThreeDViews()
+            finally:
+                self.loading = False
+        self.refresh()
+        self.unfold(self._next)
+
+    def unfold(self, name: str) -> None:
+        """Open the section of one step and close the others."""
+        for section in self.sections.values():
+            section.button.collapsed = section.name != name
+
+    def closing_scene(self) -> None:
+        """Before the scene is closed: runs end or go on as the user chose, and every node is let go."""
+        active = going_on(watch.run for watch in self.runs.values())
+        if active and self._choice(ask=True) is OnClose.END:
+            for run in active:
+                run.cancel()
+            self._ending += active
+            self._ending_timer.start()
+        for watch in self.runs.values():
+            watch.forget()
+        self._followed = None
+        for section in self.sections.values():
+            section.leave()
+            section.close()
+
+    def quitting(self) -> None:
+        """Slicer ends: nobody can be asked any more, so what is not to be ended goes on."""
+        if self.parameters is not None:
+            close_runs([watch.run for watch in self.runs.values()] + self._ending, self._choice(ask=False))
+
+    def _choice(self, ask: bool) -> OnClose:
+        choice = OnClose(self.parameters.whenClosing.value) if self.parameters else OnClose.DETACH
+        if choice is not OnClose.ASK or not ask or slicer.app.testingEnabled():
+            return choice
+        text = question(going_on(watch.run for watch in self.runs.values()))
+        goes_on = slicer.util.confirmYesNoDisplay(text, windowTitle=_("Let it go on?"))
+        return OnClose.DETACH if goes_on else OnClose.END
+
+    def _poll_ending(self) -> None:
+        self._ending = going_on(self._ending)
+        if not self._ending:
+            self._ending_timer.stop()
+
+    def _on_run(self, kind: str, status: RunStatus) -> None:
+        if kind == "train":
+            self.sections["training"].on_status(status)
+        if not status.state.active:
+            logging.info("Expected Appearances: %s is %s. %s", kind, status.state.value, status.problem)
+        if status.state is RunState.DONE and self.entered:
+            self.refresh()
+            self._go_on_from(SECTION_OF_KIND[kind])
+        self.refresh_soon()
+
+    def _show_next(self) -> None:
+        name = next_step(self.steps)
+        step = self.steps[name]
+        title = html.escape(_(self.sections[name].title))
+        if all(s.state is StepState.DONE for s in self.steps.values()):
+            self.ui.nextLabel.text = _("All done: the model is ready.")
+        else:
+            self.ui.nextLabel.text = f"<b>{_('Next')}: {title}.</b> {html.escape(step.text)}"
+        self._next = name
+
+    def _go_on_from(self, finished: str) -> None:
+        """A run has finished a step that the user is looking at: open the next one."""
+        if self.steps[finished].state is StepState.DONE and not self.sections[finished].button.collapsed:
+            self.sections[self._next].button.collapsed = False
+            # Appearances and loss are worth seeing; label maps were looked at before.
+            self.sections[finished].button.collapsed = finished == "poses"

@@ -1,0 +1,137 @@
+"""Start, progress, time left and cancel of one kind of run, and what becomes of it when things are closed."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+from collections.abc import Callable
+
+import qt
+from slicer.i18n import tr as _
+
+from ..errors import ExpectedAppearancesError
+from ..runs.runner import Run
+from ..runs.state import RunState, RunStatus, controls
+from .planning_qt import allow
+
+POLL_MS = 500
+START_TEXTS = {"start": "Start", "continue": "Continue", "again": "Make again"}
+
+
+class RunWatch:
+    """The run of one kind in the case that is open: polled, and found again when the case is opened again."""
+
+    def __init__(self, kind: str, on_change: Callable[[RunStatus], None]):
+        self.kind = kind
+        self.status = RunStatus(RunState.IDLE)
+        self.run: Run | None = None
+        self._on_change = on_change
+        self._timer = qt.QTimer()
+        self._timer.setInterval(POLL_MS)
+        self._timer.connect("timeout()", self.poll)
+
+    @property
+    def active(self) -> bool:
+        return self.run is not None and self.status.state.active
+
+    def follow(self, case_folder: str) -> None:
+        """Watch what goes on in this case, '' for none; a run of the case before is let go."""
+        self._timer.stop()
+        self.run, self.status = None, RunStatus(RunState.IDLE)
+        if case_folder:
+            self.run = Run.find(case_folder, self.kind)
+        if self.run is not None:
+            self._watch()
+
+    def start(self, case_folder: str, arguments: list[str], environment: dict[str, str] | None = None) -> None:
+        """Raises ExpectedAppearancesError when it cannot be started. environment: added for the run alone."""
+        with _environment(environment or {}):
+            self.run = Run.start(self.kind, case_folder, arguments)
+        logging.info("Expected Appearances: %s started, log %s", self.kind, self.run.log_path)
+        self._watch()
+
+    def cancel(self) -> None:
+        if self.run is not None:
+            self.run.cancel()
+            self.poll()
+
+    def forget(self) -> None:
+        """Stop watching; the run itself is left as it is."""
+        self._timer.stop()
+        self.run = None
+
+    def poll(self) -> None:
+        if self.run is None:
+            return
+        self.status = self.run.poll()
+        if not self.status.state.active:
+            self._timer.stop()
+        self._on_change(self.status)
+
+    def _watch(self) -> None:
+        self._timer.start()
+        self.poll()
+
+
+class RunControls:
+    """Start and cancel button, progress bar and line of text, kept up to date with a RunWatch."""
+
+    def __init__(self, watch: RunWatch, start_button, cancel_button, bar, label, start_hint: str, noun: str = ""):
+        self.watch = watch
+        self._start, self._cancel, self._bar, self._label = start_button, cancel_button, bar, label
+        self._start_hint, self._noun = start_hint, noun
+
+    def refresh(self, problem: str, unfinished: bool) -> None:
+        """problem: why no run can begin, '' if nothing is in the way."""
+        status = self.watch.status
+        state = controls(status.state, problem, unfinished)
+        allow(self._start, state.start, self._start_hint)
+        allow(self._cancel, state.cancel, _("End the run. What is finished is kept."))
+        text = _(START_TEXTS[state.action])
+        if self._start.text != text:
+            self._start.text = text
+        self._bar.visible = self.watch.active
+        self._bar.value = round(100 * status.fraction)
+        self._label.text = _line(status)
+        self._label.visible = bool(self._label.text)
+
+
+def _line(status: RunStatus) -> str:
+    """What the run is doing, in a line or two."""
+    if status.problem:
+        return status.problem
+    if status.state is RunState.PREPARING:
+        return _("Starting…")
+    if status.state is RunState.CANCELLING:
+        return _("Being ended…")
+    # The message ends with the time left. What is done, the section says.
+    return "" if status.state in (RunState.IDLE, RunState.DONE) else status.message
+
+
+def started(panel, watch: RunWatch, arguments: list[str], environment: dict[str, str] | None = None) -> bool:
+    """Start a run of the open case, or tell the user why it could not be."""
+    import slicer
+
+    try:
+        watch.start(panel.parameters.casePath, arguments, environment)
+    except ExpectedAppearancesError as error:
+        slicer.util.errorDisplay(str(error), windowTitle=_("Not started"))
+        return False
+    panel.refresh_soon()
+    return True
+
+
+@contextlib.contextmanager
+def _environment(values: dict[str, str]):
+    """Within the block the process has these variables, which the child then inherits."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

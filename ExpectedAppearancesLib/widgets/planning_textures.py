@@ -1,0 +1,213 @@
+"""Section Textures: photographs of cortex with their labels, seen, added, labelled and removed."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import qt
+import slicer
+from slicer.i18n import tr as _
+
+from .. import files
+from ..errors import InputError
+from ..masks.labels import VESSELS
+from ..textures.library import LABELS_SUFFIX, list_textures, read_texture, shipped_textures_folder
+from .planning_case import OWN_TEXTURES
+from .planning_labelling import Labelling
+from .planning_qt import Stepper, allow, quiet
+from .planning_section import Section, changed
+
+THUMBNAIL_PX = 84
+LARGEST_PHOTOGRAPH_PX = 1024  # synthesis uses no more
+OVERLAY_RGB = (60, 220, 90)  # no tissue is green
+
+
+class TexturesSection(Section):
+    name = "textures"
+    title = "Textures"
+
+    def setup(self) -> None:
+        ui = self.ui
+        self._stepper = Stepper()
+        self._pictures: dict[tuple, str] = {}  # version of a texture -> path of its thumbnail
+        self._listed: list | None = None
+        self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
+        self.labelling = Labelling(self.panel)
+        ui.texturesList.setIconSize(qt.QSize(THUMBNAIL_PX, THUMBNAIL_PX))
+        ui.texturesPathEdit.connect("currentPathChanged(QString)", self.on_path)
+        ui.shippedButton.connect("clicked(bool)", lambda _checked=False: self.on_shipped())
+        ui.addPhotographButton.connect("clicked(bool)", lambda _checked=False: self.on_add())
+        ui.removeTextureButton.connect("clicked(bool)", lambda _checked=False: self.on_remove())
+        ui.texturesList.connect("itemSelectionChanged()", self.panel.refresh_soon)
+        self.button.connect("contentsCollapsed(bool)", lambda _collapsed: self.panel.refresh_soon())
+
+    def refresh(self) -> None:
+        p, ui = self.parameters, self.ui
+        shipped = not p.texturesPath
+        path = str(shipped_textures_folder()) if shipped else p.texturesPath
+        if ui.texturesPathEdit.currentPath != path:
+            with quiet(ui.texturesPathEdit):
+                ui.texturesPathEdit.currentPath = path
+        allow(
+            ui.shippedButton, _("The shipped textures are chosen.") if shipped else "", _("Use the shipped textures.")
+        )
+        allow(ui.addPhotographButton, self.labelling.reason, _("Add a photograph of cortex and label its vessels."))
+        reason = ""
+        if shipped:
+            reason = _("The shipped textures cannot be removed. Choose a folder of your own.")
+        elif not ui.texturesList.selectedItems():
+            reason = _("Click on a texture first.")
+        allow(ui.removeTextureButton, reason, _("Delete the texture and its labels from the folder."))
+        self.labelling.refresh()
+        found = self.session.texture_files(p)
+        versions = [version for version, *_rest in found.values()]
+        # Opening the module must not load OpenCV: textures are read when they are looked at or compared with.
+        wanted = not self.button.collapsed or self.panel.recorded.index is not None
+        if wanted and versions != self._listed:
+            self._listed = versions
+            self._stepper.start(self._show(found))
+
+    def leave(self) -> None:
+        self._stepper.stop()
+        self._listed = None
+
+    def close(self) -> None:
+        self.leave()
+        self.labelling.stop()
+
+    def _show(self, found: dict):
+        """Read one texture at each step, then list them all."""
+        known = self.session
+        for name, (version, image_path, labels_path) in found.items():
+            if version not in known.texture_digests and version not in known.texture_problems:
+                self._read(name, version, image_path, labels_path)
+                yield
+        self.ui.texturesList.clear()
+        for name, (version, *_rest) in found.items():
+            item = qt.QListWidgetItem(name)
+            if version in self._pictures:
+                item.setIcon(qt.QIcon(self._pictures[version]))
+            if version in known.texture_problems:
+                item.setToolTip(known.texture_problems[version])
+                item.setText(f"{name} !")
+            else:
+                item.setToolTip(_("{name}: vessels outlined in green").format(name=name))
+            item.setData(qt.Qt.UserRole, name)
+            self.ui.texturesList.addItem(item)
+        self.panel.refresh_soon()
+
+    def _read(self, name: str, version: tuple, image_path: Path, labels_path: Path | None) -> None:
+        try:
+            texture = read_texture(name, image_path, labels_path)
+        except InputError as error:
+            self.session.texture_problems[version] = str(error)
+            return
+        except ImportError:  # without OpenCV: the pictures alone
+            self.session.texture_digests[version] = ""
+            self._pictures[version] = str(image_path)
+            return
+        self.session.texture_digests[version] = texture.sha256
+        path = Path(self._folder.name) / f"{texture.sha256}.png"
+        files.write_png(path, thumbnail(texture.image, texture.labels, THUMBNAIL_PX))
+        self._pictures[version] = str(path)
+
+    def on_path(self, _path=None) -> None:
+        path = self.ui.texturesPathEdit.currentPath
+        changed(self.parameters, "texturesPath", "" if path == str(shipped_textures_folder()) else path)
+
+    def on_shipped(self) -> None:
+        changed(self.parameters, "texturesPath", "")
+
+    def on_add(self, path: str = "") -> None:
+        """Choose a photograph; it is labelled in the Segment Editor, and then saved as NAME.png, NAME.labels.png."""
+        if not path:
+            path = qt.QFileDialog.getOpenFileName(
+                slicer.util.mainWindow(),
+                _("Photograph of cortex"),
+                str(Path.home()),
+                _("Images (*.png *.jpg *.jpeg *.tif *.tiff)"),
+            )
+        if not path or not self._own_folder():
+            return
+        try:
+            image = files.read_image_rgb(Path(path))
+        except InputError as error:
+            slicer.util.errorDisplay(str(error))
+            return
+        except ImportError:
+            slicer.util.errorDisplay(
+                _("Reading photographs needs the Python package cv2: install what is missing first.")
+            )
+            return
+        taken = list_textures(self.session.textures_folder(self.parameters))
+        name = stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in Path(path).stem) or "photograph"
+        number = 2
+        while name in taken:
+            name, number = f"{stem}-{number}", number + 1
+        self.labelling.start(name, smaller(image, LARGEST_PHOTOGRAPH_PX))
+
+    def _own_folder(self) -> bool:
+        """A folder that photographs can be added to: the chosen one, else one in the case with the shipped textures."""
+        p = self.parameters
+        if p.texturesPath:
+            return True
+        case = self.session.case(p)
+        if case is None:
+            slicer.util.errorDisplay(
+                _("Choose a folder for your textures first, or save the case: then they go there.")
+            )
+            return False
+        folder = case.folder / OWN_TEXTURES
+        if not folder.is_dir():
+            shutil.copytree(shipped_textures_folder(), folder)
+        changed(p, "texturesPath", str(folder))
+        return True
+
+    def on_remove(self) -> None:
+        folder = self.session.textures_folder(self.parameters)
+        names = [item.data(qt.Qt.UserRole) for item in self.ui.texturesList.selectedItems()]
+        listed = list_textures(folder)
+        if (
+            not names
+            or not self.parameters.texturesPath
+            or not slicer.util.confirmYesNoDisplay(
+                _("Delete {names} with labels from {folder}?").format(names=", ".join(names), folder=folder)
+            )
+        ):
+            return
+        for name in names:
+            image, _labels = listed.get(name, (None, None))
+            for path in (image, folder / f"{name}{LABELS_SUFFIX}"):
+                if path is not None:
+                    path.unlink(missing_ok=True)
+        self.panel.refresh_soon()
+
+
+def thumbnail(image_rgb: np.ndarray, labels: np.ndarray, side_px: int) -> np.ndarray:
+    """uint8 (side, side, 3): the middle of the picture with the vessels' outlines drawn over it."""
+    import cv2
+
+    side = min(image_rgb.shape[:2])
+    top, left = ((length - side) // 2 for length in image_rgb.shape[:2])
+    image = cv2.resize(
+        image_rgb[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_AREA
+    )
+    shown = cv2.resize(
+        labels[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_NEAREST
+    )
+    vessels = (shown == VESSELS).astype(np.uint8)
+    image[(vessels == 1) & (cv2.erode(vessels, np.ones((3, 3), np.uint8)) == 0)] = OVERLAY_RGB
+    return image
+
+
+def smaller(image_rgb: np.ndarray, side_px: int) -> np.ndarray:
+    """The picture with its longer side at most side_px."""
+    import cv2
+
+    scale = side_px / max(image_rgb.shape[:2])
+    if scale >= 1:
+        return image_rgb
+    return cv2.resize(image_rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

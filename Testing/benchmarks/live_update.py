@@ -1,0 +1,197 @@
+"""From a new 1920 x 1080 frame to its overlay on the screen, beside a loop that loads and makes everything anew.
+
+The frames are a phantom's, whose poses are known; its model costs what the quick preset's does, since it is that
+network, untrained, with the phantom's few operations added to it. Both are checked to give the right pose.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+TESTING = Path(__file__).resolve().parents[1]
+FRAME = (1920, 1080)
+VIEW = (640, 480)
+FRAMES = 20
+ROUNDS = 2
+REFERENCE_FRAMES = 4
+ADD_LIMIT_MM = 1.0
+
+
+def measure(inputs_folder: Path | None = None) -> dict:
+    """live_update: {median_ms, ratio, ...}. inputs_folder: vessels.vtp and cortex.vtp; without it, generated ones."""
+    sys.path.insert(0, str(TESTING))
+    from mrml_views import SliceView, new_application
+
+    from ExpectedAppearancesLib.demo.phantom import PhantomPainter
+    from ExpectedAppearancesLib.mrml.live_controller import LiveController
+    from ExpectedAppearancesLib.mrml.live_views import LiveViews
+
+    with tempfile.TemporaryDirectory() as folder:
+        phantom = _case(Path(folder), inputs_folder)
+        poses = [phantom.pose(i / FRAMES) for i in range(FRAMES)]
+        with PhantomPainter(phantom) as painter:
+            frames = [painter.paint(pose) for pose in poses]
+        scene, application = new_application()
+        view = SliceView(scene, application, "Microscope", VIEW)
+        controller = LiveController(scene, LiveViews(view.node, view.composite, lambda: None))
+        live_ms, blocked_ms, plain_ms = [], [], []
+        _run_live(controller, view, phantom, poses, frames, [], [])
+        for _ in range(ROUNDS):
+            _run_live(controller, view, phantom, poses, frames, live_ms, blocked_ms)
+            _run_plain(scene, view, phantom, poses[:REFERENCE_FRAMES], frames, plain_ms)
+        controller.close()
+    return {
+        "median_ms": round(float(np.median(live_ms)), 1),
+        "p95_ms": round(float(np.percentile(live_ms, 95)), 1),
+        "gui_blocked_median_ms": round(float(np.median(blocked_ms)), 1),
+        "gui_blocked_longest_ms": round(float(np.max(blocked_ms)), 1),
+        "reference_median_ms": round(float(np.median(plain_ms)), 1),
+        "ratio": round(float(np.median(plain_ms) / np.median(live_ms)), 2),
+        "frame_px": list(FRAME),
+        "view_px": list(VIEW),
+    }
+
+
+def _case(folder: Path, inputs_folder: Path | None):
+    from ExpectedAppearancesLib import files
+    from ExpectedAppearancesLib.case.case import Case
+    from ExpectedAppearancesLib.case.meshes import write_vtp
+    from ExpectedAppearancesLib.demo.phantom import as_phantom
+    from ExpectedAppearancesLib.demo.vessel_tree import generate_case_meshes
+    from ExpectedAppearancesLib.geometry.camera import Camera
+
+    if inputs_folder is None:
+        inputs_folder = folder
+        for name, mesh in zip(("vessels", "cortex"), generate_case_meshes(0)):
+            write_vtp(folder / f"{name}.vtp", mesh)
+    camera = Camera(*FRAME, 4300.0, 4300.0, 975.0, 520.0)
+    paths = [Path(inputs_folder) / f"{name}.vtp" for name in ("vessels", "cortex")]
+    case = Case.create(folder / "case", *paths, camera)
+    phantom = as_phantom(case)
+    # In a process of its own: VTK and torch's exporter do not go together.
+    subprocess.run([sys.executable, __file__, "--write-network", str(case.model_folder / "model.onnx")], check=True)
+    meta = files.read_json(case.model_folder / "model.json", "model")
+    meta["model_sha256"] = files.sha256(case.model_folder / "model.onnx")
+    files.write_json(case.model_folder / "model.json", meta)
+    return phantom
+
+
+def write_network(path: Path) -> None:
+    """The quick preset's network, untrained, plus the phantom's operations: the phantom's output at the real cost."""
+    import torch
+
+    from ExpectedAppearancesLib.demo.phantom import GAIN, MIDDLE, SIZE_PX
+    from ExpectedAppearancesLib.model.networks import DenseSurfaceNet
+    from ExpectedAppearancesLib.model.presets import PRESETS
+
+    class Both(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.network = DenseSurfaceNet(PRESETS["quick"].width)
+
+        def forward(self, image):
+            coordinates = (torch.nn.functional.avg_pool2d(image, 2) - MIDDLE) / GAIN
+            darkest = torch.nn.functional.max_pool2d(-image, 6, 2, 2).amax(dim=1, keepdim=True)
+            surface = -100 * (darkest + 0.08)
+            sigma = torch.zeros_like(surface) + float(np.log(0.01))
+            read = torch.cat([coordinates, sigma, surface, torch.zeros_like(surface) - 1], dim=1)
+            return read + 1e-12 * self.network(image)[:, :6]
+
+    network = Both().eval()
+    with torch.no_grad():
+        torch.onnx.export(
+            network,
+            (torch.rand(1, 3, SIZE_PX, SIZE_PX),),
+            str(path),
+            input_names=["image"],
+            output_names=["output"],
+            opset_version=17,
+            dynamo=False,
+        )
+
+
+def _run_live(controller, view, phantom, poses, frames, update_ms: list, blocked_ms: list) -> None:
+    from ExpectedAppearancesLib.live.choice import Choice, SourceKind
+    from ExpectedAppearancesLib.live.frames import LiveFrame
+
+    scene = controller._scene
+    source = scene.AddNewNodeByClass("vtkMRMLVectorVolumeNode", "Stream")
+    controller.start(Choice(str(phantom.case.folder), SourceKind.NODE, node_name=source.GetID(), stale_s=10))
+    for i, (pose, frame) in enumerate(zip(poses, frames)):
+        begin = time.perf_counter()
+        controller._session.push(LiveFrame(frame, time.monotonic(), i))
+        status = controller.tick(0.5)  # an idle GUI thread: woken by the result
+        woken = time.perf_counter()
+        while not status.new:
+            status = controller.tick(0.5)
+        if i == 0:
+            view.draw_layers()
+        view.window.Render()
+        end = time.perf_counter()
+        _check(phantom, pose, status.result.prediction.camera_from_world)
+        if i > 1:
+            update_ms.append((end - begin) * 1000)
+            blocked_ms.append((end - woken) * 1000 + controller.shown_in_ms)
+    controller.stop()
+    scene.RemoveNode(source)
+
+
+def _run_plain(scene, view, phantom, poses, frames, update_ms: list) -> None:
+    """What one writes first: for each frame the model is loaded, and the nodes are made."""
+    from ExpectedAppearancesLib.case.case import Case
+    from ExpectedAppearancesLib.geometry.pose import camera_to_ras
+    from ExpectedAppearancesLib.geometry.silhouette import Silhouette
+    from ExpectedAppearancesLib.mrml import live_views
+    from ExpectedAppearancesLib.mrml import scene as scenes
+    from ExpectedAppearancesLib.registration.predictor import Predictor
+
+    for pose, frame in zip(poses, frames):
+        begin = time.perf_counter()
+        case = Case.open(phantom.case.folder)
+        prediction = Predictor(case.model_folder).predict(frame)
+        predicted = prediction.camera_from_world
+        nodes = scene.GetNumberOfNodes()
+        plane_mm = scenes.plane_depth_mm(case.vessels, predicted)
+        to_ras = camera_to_ras(predicted, case.space)
+        transform = scenes.add_camera_transform(scene, to_ras)
+        volume = scenes.add_frame(scene, frame, case.camera, plane_mm, transform)
+        silhouette = Silhouette(case.vessels.vertices_mm, case.vessels.triangles)
+        scenes.add_outline(scene, silhouette, predicted, plane_mm, transform)
+        live_views.align_slice(view.node, case.camera, to_ras, plane_mm)
+        live_views.fit_slice(view.node, case.camera, plane_mm)
+        live_views.show_layers(view.composite, volume, None, 0)
+        view.window.Render()
+        update_ms.append((time.perf_counter() - begin) * 1000)
+        _check(phantom, pose, predicted)
+        while scene.GetNumberOfNodes() > nodes:
+            scene.RemoveNode(scene.GetNthNode(scene.GetNumberOfNodes() - 1))
+
+
+def _check(phantom, true: np.ndarray, predicted: np.ndarray | None) -> None:
+    from ExpectedAppearancesLib.evaluation.metrics import add_mm
+
+    if predicted is None or add_mm(phantom.case.vessels.vertices_mm, true[None], predicted[None])[0] > ADD_LIMIT_MM:
+        raise RuntimeError("the phantom's pose is wrong; what is measured is not a registration")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--inputs", type=Path, metavar="DIR", help="vessels.vtp and cortex.vtp; else generated")
+    parser.add_argument("--write-network", type=Path, metavar="FILE", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.write_network:
+        write_network(args.write_network)
+        return
+    print(json.dumps({"live_update": measure(args.inputs)}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from cases import camera, write_inputs
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.cli import main
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.geometry.pose import look_at
+from ExpectedAppearancesLib.model.encoding import fit_encoding
+from ExpectedAppearancesLib.registration import predictor as predictor_module
+from ExpectedAppearancesLib.registration.footage import Footage
+from ExpectedAppearancesLib.registration.poses_file import read_poses
+from ExpectedAppearancesLib.registration.predictor import Prediction
+
+LEVELS = range(20, 240, 11)  # grey level of each frame of the test video
+
+
+def grey(level: int, size: int = 96) -> np.ndarray:
+    return np.full((size, size, 3), (level, level // 2, 60), np.uint8)
+
+
+@pytest.fixture
+def video(tmp_path):
+    """20 frames at 12.5 Hz, each told by its red."""
+    path = tmp_path / "Op ä.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 12.5, (96, 96))
+    for level in LEVELS:
+        writer.write(np.ascontiguousarray(grey(level)[..., ::-1]))
+    writer.release()
+    return path
+
+
+def test_video_gives_its_frames_in_rgb_with_their_times(video):
+    footage = Footage([video])
+    frames = list(footage)
+    assert footage.is_video and footage.count == len(frames) == len(LEVELS)
+    np.testing.assert_allclose([f.time_s for f in frames], np.arange(20) / 12.5, atol=1e-6)
+    assert [f.image.name for f in frames[:2]] == ["Op ä.avi#frame=0", "Op ä.avi#frame=1"]
+    # Kept frames must not be overwritten by later ones.
+    for level, frame in zip(LEVELS, frames, strict=True):
+        np.testing.assert_allclose(frame.read_rgb()[40, 40], [level, level // 2, 60], atol=6)
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".avi", "MJPG"), (".mp4", "mp4v")])
+def test_a_written_frame_can_be_read_again(tmp_path, suffix, codec):
+    path = tmp_path / f"v{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, (96, 96))
+    for level in LEVELS:
+        writer.write(np.ascontiguousarray(grey(level)[..., ::-1]))
+    writer.release()
+    for number in (13, 0, 19):
+        image = files.read_image_rgb(tmp_path / f"v{suffix}#frame={number}")
+        np.testing.assert_allclose(image[40, 40], grey(LEVELS[number])[0, 0], atol=6)
+    for wrong in (f"v{suffix}#frame=20", f"v{suffix}#frame=x", f"w{suffix}#frame=1"):
+        with pytest.raises(InputError, match=wrong):
+            files.read_image_rgb(tmp_path / wrong)
+
+
+def test_a_given_rate_replaces_the_videos_and_times_images(video, tmp_path):
+    assert [f.time_s for f in Footage([video], 50.0)][:3] == pytest.approx([0, 0.02, 0.04])
+    paths = [tmp_path / f"{i}.png" for i in (2, 1)]
+    for path in paths:
+        files.write_png(path, grey(int(path.stem)))
+    frames = list(Footage(paths, 4.0))
+    assert [(f.image, f.time_s) for f in frames] == [(paths[0], 0.0), (paths[1], 0.25)]
+    assert [int(f.read_rgb()[0, 0, 0]) for f in frames] == [2, 1]
+    assert [f.time_s for f in Footage(paths)] == [None, None]
+
+
+def test_footage_that_cannot_be_read_is_named(video, tmp_path):
+    with pytest.raises(InputError) as caught:
+        Footage([video, tmp_path / "none.png", tmp_path / "gone.png"], 0.0)
+    assert len(caught.value.problems) == 4
+    assert all(word in str(caught.value) for word in ("none.png", "gone.png", "on its own", "--fps"))
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"no video")
+    with pytest.raises(InputError, match=r"broken\.mp4.*not a video"):
+        Footage([broken])
+    cut = tmp_path / "cut.avi"
+    cut.write_bytes(video.read_bytes()[: video.stat().st_size * 3 // 4])
+    assert 0 < len(list(Footage([cut], 12.5))) < 20
+
+
+class SteadyPredictor:
+    """A camera that moves by 1 mm a frame; frames 6 and 7 are refused, 12 is far off, found by their red."""
+
+    estimator = "dense"
+    gives_covariance = True
+    encoding = fit_encoding(np.eye(4)[None], np.zeros(3), 20.0)
+
+    def __init__(self, _folder=None):
+        pass
+
+    def predict(self, image, _camera):
+        number = round((int(image[40, 40, 0]) - LEVELS.start) / LEVELS.step)
+        x = number + (60.0 if number == 12 else 0.0)
+        pose = look_at(np.array([x - 8, 5.0, 80.0]), np.array([x, 0, 0]), np.array([0, 1, 0]))
+        covariance = np.diag([0.01**2] * 3 + [0.3**2] * 3)
+        return Prediction(pose, number not in (6, 7), 0.99, 5.0, covariance)
+
+
+@pytest.fixture
+def case(tmp_path, monkeypatch):
+    monkeypatch.setattr(predictor_module, "Predictor", SteadyPredictor)
+    paths = write_inputs(tmp_path)
+    return Case.create(tmp_path / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
+
+
+def test_register_writes_tracked_poses_beside_the_raw_ones(case, video, tmp_path, capsys):
+    out = tmp_path / "out" / "poses.json"
+    assert main(["register", str(case.folder), str(video), "--out", str(out), "--track"]) == 0
+    assert "18 of 20 frames have a tracked pose" in capsys.readouterr().out
+    stored_camera, frames = read_poses(out)
+    assert stored_camera.matrix.tolist() == camera().matrix.tolist() and len(frames) == 20
+    states = [frame.extra["tracking"]["state"] for frame in frames]
+    assert (
+        states
+        == ["lost"] * 2 + ["tracking"] * 4 + ["coasting"] * 2 + ["tracking"] * 4 + ["coasting"] + ["tracking"] * 7
+    )
+    assert frames[0].extra["tracked_camera_from_world"] is None and frames[0].extra["tracking"]["covariance"] is None
+    assert frames[5].extra["time_s"] == pytest.approx(0.4)
+    assert np.shape(frames[3].extra["covariance"]) == np.shape(frames[3].extra["tracking"]["covariance"]) == (6, 6)
+    true = SteadyPredictor().predict(grey(LEVELS[11]), None).camera_from_world[:3, 3] + [-1.0, 0, 0]
+    tracked = np.array(frames[12].extra["tracked_camera_from_world"])[:3, 3]
+    assert np.linalg.norm(frames[12].camera_from_world[:3, 3] - true) > 30 and np.linalg.norm(tracked - true) < 1
+
+
+def test_register_without_track_is_as_before(case, video, tmp_path):
+    out = tmp_path / "poses.json"
+    assert main(["register", str(case.folder), str(video), "--out", str(out)]) == 0
+    first = json.loads(out.read_text())["frames"][0]
+    assert "tracking" not in first and first["image"] == "Op ä.avi#frame=0" and first["time_s"] == 0
+
+
+def test_tracking_of_images_needs_their_rate_and_a_model_with_covariance(case, tmp_path, capsys, monkeypatch):
+    paths = []
+    for i, level in enumerate(LEVELS):
+        paths.append(str(tmp_path / f"{i}.png"))
+        files.write_png(paths[-1], grey(level))
+    out = tmp_path / "poses.json"
+    command = ["register", str(case.folder), *paths, "--out", str(out), "--track"]
+    monkeypatch.setattr(SteadyPredictor, "gives_covariance", False)
+    assert main(command) == 2
+    text = capsys.readouterr().err
+    assert "--fps" in text and "train" in text and not out.exists()
+    monkeypatch.setattr(SteadyPredictor, "gives_covariance", True)
+    assert main([*command, "--fps", "12.5"]) == 0
+    assert [f.extra["tracking"]["state"] for f in read_poses(out)[1]].count("tracking") == 15

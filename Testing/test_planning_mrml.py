@@ -1,0 +1,456 @@
+"""Planning on slicer-core's real scene: models and segments in, cameras and label maps out, measured with OpenCV."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from enum import Enum
+from types import SimpleNamespace
+
+import cases
+import cv2
+import numpy as np
+import pytest
+
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.case.meshes import Mesh, read_mesh
+from ExpectedAppearancesLib.case.steps import StepState
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.geometry.camera import Camera, read_camera
+from ExpectedAppearancesLib.geometry.pose import look_at
+from ExpectedAppearancesLib.masks.renderer import MaskRenderer
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
+
+slicer = pytest.importorskip("slicer")
+import vtk  # noqa: E402 (after the skip)
+from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
+
+from ExpectedAppearancesLib.mrml import charts, labelling, planning  # noqa: E402
+from ExpectedAppearancesLib.mrml.planning_adopt import adopt  # noqa: E402
+from ExpectedAppearancesLib.mrml.planning_session import PlanningSession, write_plain_mesh  # noqa: E402
+
+LPS = np.array([-1.0, -1.0, 1.0])
+POSE = look_at(np.array([25.0, -18.0, 90.0]), np.array([1.0, 0.5, -2.0]), np.array([0.2, 1.0, 0.0]))
+
+
+@pytest.fixture
+def scene():
+    scene = slicer.vtkMRMLScene()
+    logic = slicer.vtkSlicerApplicationLogic()
+    logic.SetMRMLScene(scene)
+    logic.GetColorLogic().SetMRMLScene(scene)
+    logic.GetColorLogic().AddDefaultColorNodes()
+    logic.SetSliceLogics(vtk.vtkCollection())
+    segmentations = slicer.vtkSlicerSegmentationsModuleLogic()  # registers what makes surfaces of segments
+    segmentations.SetMRMLScene(scene)
+    scene.keep_alive = (logic, segmentations)
+    return scene
+
+
+def add_model(scene, mesh: Mesh, name="Vessels"):
+    """Model node with the mesh's vertices as RAS."""
+    node = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
+    node.SetAndObservePolyData(mesh.to_polydata())
+    return node
+
+
+def add_transform(scene, matrix: np.ndarray, parent=None):
+    node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode")
+    result = vtk.vtkMatrix4x4()
+    result.DeepCopy(matrix.ravel().tolist())
+    node.SetMatrixTransformToParent(result)
+    if parent:
+        node.SetAndObserveTransformNodeID(parent.GetID())
+    return node
+
+
+def turned() -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0]
+    matrix[:3, 3] = 12.0, -7.0, 30.0
+    return matrix
+
+
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_models_are_taken_in_world_coordinates_and_left_alone(scene, space):
+    mesh = cases.vessels()
+    node = add_model(scene, mesh)
+    second = np.diag([1.0, 1.0, 1.0, 1.0])
+    second[:3, 3] = 0.0, 100.0, 0.0
+    node.SetAndObserveTransformNodeID(add_transform(scene, turned(), add_transform(scene, second)).GetID())
+    before = node.GetPolyData().GetMTime()
+    found = planning.world_mesh(node, space=space)
+    expected_ras = mesh.vertices_mm @ turned()[:3, :3].T + turned()[:3, 3] + [0, 100, 0]
+    np.testing.assert_allclose(found.vertices_mm * (LPS if space == "LPS" else 1), expected_ras, atol=1e-4)
+    np.testing.assert_array_equal(found.triangles, mesh.triangles)
+    assert node.GetPolyData().GetMTime() == before
+    assert node.GetParentTransformNode() is not None
+
+
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_model_file_and_back_keeps_the_space(scene, tmp_path, space):
+    """Slicer's own storage node is the judge of what the file's coordinates are."""
+    mesh = planning.world_mesh(add_model(scene, cases.vessels()), space=space)
+    write_plain_mesh(tmp_path / "mesh.vtk", mesh, space)
+    np.testing.assert_allclose(read_mesh(tmp_path / "mesh.vtk", "mesh").vertices_mm, mesh.vertices_mm, atol=1e-9)
+    storage = slicer.vtkMRMLModelStorageNode()
+    storage.SetFileName(str(tmp_path / "mesh.vtk"))
+    node = scene.AddNewNodeByClass("vtkMRMLModelNode")
+    assert storage.ReadData(node)
+    in_ras = vtk_to_numpy(node.GetPolyData().GetPoints().GetData())
+    np.testing.assert_allclose(in_ras, cases.vessels().vertices_mm, atol=1e-4)
+
+
+def test_segment_becomes_a_surface_in_a_copy(scene):
+    image = slicer.vtkOrientedImageData()
+    image.SetDimensions(40, 40, 40)
+    image.SetSpacing(0.5, 0.5, 0.5)
+    image.SetOrigin(10, 20, 30)
+    image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
+    voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(40, 40, 40)
+    voxels[:] = 0
+    voxels[10:30, 10:20, 10:20] = 1  # k, j, i
+    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Segmentation")
+    node.AddSegmentFromBinaryLabelmapRepresentation(image, "Vessels")
+    identifier = node.GetSegmentation().GetNthSegmentID(0)
+    shift = np.eye(4)
+    shift[:3, 3] = 100, 0, 0
+    node.SetAndObserveTransformNodeID(add_transform(scene, shift).GetID())
+    mesh = planning.world_mesh(node, identifier, "RAS")
+    # Voxel centres 10..19 and 10..29, half a millimetre apart, from the origin.
+    middle = np.array([110, 20, 30]) + 0.5 * np.array([14.5, 14.5, 19.5])
+    np.testing.assert_allclose((mesh.vertices_mm.min(0) + mesh.vertices_mm.max(0)) / 2, middle, atol=0.05)
+    np.testing.assert_allclose(np.ptp(mesh.vertices_mm, axis=0), [5, 5, 10], atol=0.6)
+    assert not node.GetSegmentation().ContainsRepresentation("Closed surface")
+    with pytest.raises(InputError, match="choose the segment"):
+        planning.world_mesh(node, "absent")
+
+
+def test_what_has_no_surface_is_refused(scene):
+    node = scene.AddNewNodeByClass("vtkMRMLModelNode", "Empty")
+    with pytest.raises(InputError, match="Empty: holds no surface"):
+        planning.world_mesh(node)
+    line = vtk.vtkLineSource()
+    line.Update()
+    node.SetAndObservePolyData(line.GetOutput())
+    with pytest.raises(InputError, match="no triangles"):
+        planning.world_mesh(node)
+
+
+def test_craniotomy_from_a_point_and_from_a_curve(scene):
+    vessels, cortex = cases.vessels(), cases.dome()
+    point = scene.AddNewNodeByClass("vtkMRMLMarkupsFiducialNode", "Point")
+    with pytest.raises(InputError, match="click on the cortex"):
+        planning.craniotomy_of_markups(point, vessels, cortex, "LPS")
+    point.AddControlPoint(*(np.array([3.0, 4.0, -1.0]) * LPS))
+    found = planning.craniotomy_of_markups(point, vessels, cortex, "LPS")
+    np.testing.assert_allclose(found.centre_world_mm, [3, 4, -1], atol=1e-9)
+    np.testing.assert_allclose(found.outward_axis, find_craniotomy(vessels, cortex).outward_axis)
+
+    curve = scene.AddNewNodeByClass("vtkMRMLMarkupsClosedCurveNode", "Curve")
+    normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+    across = np.linalg.svd(normal[None])[2][1:]
+    # Many points on one side: the centre must not be drawn there.
+    for angle in np.concatenate([np.linspace(0, np.pi, 9)[:-1], [np.pi, 1.5 * np.pi]]):
+        position = np.array([1.0, 2.0, 3.0]) + 10 * (np.cos(angle) * across[0] + np.sin(angle) * across[1])
+        curve.AddControlPoint(*(position * LPS))
+        if curve.GetNumberOfControlPoints() == 2:
+            with pytest.raises(InputError, match="fewer than 3"):
+                planning.craniotomy_of_markups(curve, vessels, cortex, "LPS")
+    found = planning.craniotomy_of_markups(curve, vessels, cortex, "LPS")
+    np.testing.assert_allclose(found.centre_world_mm, [1, 2, 3], atol=0.6)
+    np.testing.assert_allclose(found.outward_axis, normal, atol=0.02)
+
+
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_frustums_hold_what_their_cameras_see(scene, space):
+    """The drawn corners, projected by OpenCV, are the image's corners; the tick is above the image's upper side."""
+    camera = cases.camera()
+    poses = np.stack([POSE, look_at(np.array([-9.0, 30.0, 70.0]), np.zeros(3), np.array([0.0, 1.0, 0.2]))])
+    lengths_mm = planning.frustum_lengths_mm(poses, np.zeros(3))
+    polydata = planning.frustum_polydata(camera, poses, lengths_mm, space)
+    points = vtk_to_numpy(polydata.GetPoints().GetData()).reshape(2, 6, 3) * (LPS if space == "LPS" else 1)
+    for pose, corners in zip(poses, points):
+        np.testing.assert_allclose(pose[:3, :3] @ corners[0] + pose[:3, 3], 0, atol=1e-9)
+        rotation = cv2.Rodrigues(pose[:3, :3])[0]
+        pixels = cv2.projectPoints(corners[1:], rotation, pose[:3, 3], camera.matrix, None)[0].reshape(-1, 2)
+        right, bottom = camera.width - 0.5, camera.height - 0.5
+        np.testing.assert_allclose(
+            pixels[:4], [[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]], atol=1e-6
+        )
+        assert pixels[4, 1] < -5
+    assert polydata.GetNumberOfLines() == 20
+    node = planning.line_model(scene, None, "Cameras", polydata, (1, 0, 0))
+    count = scene.GetNumberOfNodes()
+    assert planning.line_model(scene, node, "Cameras", polydata, (1, 0, 0)) is node
+    assert scene.GetNumberOfNodes() == count
+
+
+class SliceView:
+    """A slice view without Qt, of the size of the label map's pixels."""
+
+    def __init__(self, scene, size):
+        self.logic = slicer.vtkMRMLSliceLogic()
+        self.logic.SetMRMLApplicationLogic(scene.keep_alive[0])
+        scene.keep_alive[0].GetSliceLogics().AddItem(self.logic)
+        slicer.vtkMRMLSliceNode.AddDefaultSliceOrientationPresets(scene, True)
+        self.logic.SetMRMLScene(scene)
+        self.node = self.logic.AddSliceNode("Red")
+        self.logic.ResizeSliceNode(*size)
+
+    def pixels(self) -> np.ndarray:
+        """RGB (H, W, 3), top row first."""
+        connection = self.logic.GetImageDataConnection()
+        connection.GetProducer().Update()
+        image = connection.GetProducer().GetOutputDataObject(connection.GetIndex())
+        width, height, _ = image.GetDimensions()
+        return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(height, width, -1)[::-1, :, :3]
+
+
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_label_map_in_the_slice_view_is_the_librarys_pixel_by_pixel(scene, space):
+    camera = Camera(96, 80, 180.0, 180.0, 50.0, 37.5)  # square pixels, as a slice view has
+    with MaskRenderer(cases.vessels(), cases.dome(), camera) as renderer:
+        labels = renderer.render(POSE)
+    assert set(np.unique(labels)) == {0, 1, 2}
+    plane_mm = planning.plane_through(np.zeros(3), POSE)
+    nodes: dict = {}
+    volume = planning.show_mask(scene, nodes, labels, camera, POSE, plane_mm, space)
+    view = SliceView(scene, (camera.width, camera.height))
+    planning.look_at_mask(view.node, camera, POSE, plane_mm, space)
+    view.logic.GetSliceCompositeNode().SetLabelVolumeID(volume.GetID())
+    view.logic.GetSliceCompositeNode().SetLabelOpacity(1.0)
+    shown = view.pixels().astype(int)
+    colours = (255 * np.array(planning.CLASS_COLOURS)[:, :3]).round().astype(int)
+    nearest = np.abs(shown[:, :, None] - colours).sum(axis=-1).argmin(axis=-1)
+    np.testing.assert_array_equal(nearest, labels)
+    # Another pose moves the same nodes.
+    count = scene.GetNumberOfNodes()
+    assert planning.show_mask(scene, nodes, labels, camera, POSE, 50.0, space) is volume
+    assert scene.GetNumberOfNodes() == count
+    planning.remove_nodes(scene, nodes)
+    assert scene.GetNumberOfNodesByClass("vtkMRMLLabelMapVolumeNode") == 0
+    assert nodes == {}
+
+
+def test_photograph_and_labels_survive_the_segment_editors_form(scene):
+    rng = np.random.default_rng(4)
+    image = rng.integers(0, 255, (40, 60, 3), dtype=np.uint8)
+    labels = np.ones((40, 60), np.uint8)
+    labels[5:9, 10:50] = 2
+    labels[:, :3] = 0
+    before = scene.GetNumberOfNodes()
+    nodes = labelling.add_photograph(scene, "cortex", image, labels)
+    np.testing.assert_array_equal(labelling.labels_of(nodes), labels)
+    segmentation = nodes["segmentation"].GetSegmentation()
+    segmentation.RemoveSegment(segmentation.GetSegmentIdBySegmentName("Outside of the cortex"))
+    np.testing.assert_array_equal(labelling.labels_of(nodes), np.maximum(labels, 1))
+    planning.remove_nodes(scene, nodes)
+    assert scene.GetNumberOfNodes() == before
+    nodes = labelling.add_photograph(scene, "no vessels", image, np.ones((40, 60), np.uint8))
+    assert (labelling.labels_of(nodes) == 1).all()
+
+
+def test_plots_are_found_again_and_filled_anew(scene):
+    curve = [{"step": 10, "loss": None, "validation_add_mm": 5.0}, {"step": 20, "loss": 1.0, "validation_add_mm": 4.0}]
+    chart = charts.show_training(scene, curve)
+    count = scene.GetNumberOfNodes()
+    curve.append({"step": 30, "loss": 0.5, "validation_add_mm": float("nan")})
+    assert charts.show_training(scene, curve) is chart
+    assert scene.GetNumberOfNodes() == count
+    series = {chart.GetNthPlotSeriesNode(i).GetName(): chart.GetNthPlotSeriesNode(i) for i in range(2)}
+    rows = {name: node.GetTableNode().GetNumberOfRows() for name, node in series.items()}
+    assert rows == {"Validation ADD (mm)": 2, "Loss": 2}
+
+
+class Source(Enum):
+    FILE, VIEW = "file", "view"
+
+
+class Where(Enum):
+    FITTED, MARKED, RECORDED = "fitted", "marked", "recorded"
+
+
+class How(Enum):
+    SURFACE, IMAGE = "surface", "image"
+
+
+class Preset(Enum):
+    QUICK, BEST, PAPER = "quick", "best", "paper"
+
+
+def parameters(**values) -> SimpleNamespace:
+    usual = dict(vesselsNode=None, vesselsSegmentId="", cortexModel=None, casePath="", cameraSource=Source.FILE)
+    usual |= dict(calibrationPath="", fieldOfViewMm=40.0, viewedAtMm=300.0, imageWidthPx=192, imageHeightPx=108)
+    usual |= dict(craniotomySource=Where.FITTED, craniotomyNode=None, tiltMaxDeg=50.0, rollMaxDeg=45.0)
+    usual |= dict(distanceAuto=True, nearestMm=80.0, farthestMm=140.0, lateralAuto=True, lateralMm=3.0)
+    usual |= dict(inViewPercent=60.0, poseCount=4, seed=0, texturesPath="", method=How.SURFACE, sizePx=384)
+    usual |= dict(iterations=50, preset=Preset.QUICK, minutes=26.0, addLimitMm=3.0, acceptedLimitPercent=50.0)
+    return SimpleNamespace(**(usual | dict(accuracyLimitPercent=80.0) | values))
+
+
+@pytest.fixture
+def planned(scene, tmp_path):
+    """Session and parameters with models chosen, under a transform; and the folder of their files."""
+    paths = cases.write_inputs(tmp_path)
+    parent = add_transform(scene, turned())
+    nodes = [add_model(scene, cases.vessels()), add_model(scene, cases.dome(), "Cortex")]
+    for node in nodes:
+        node.SetAndObserveTransformNodeID(parent.GetID())
+    return PlanningSession(), parameters(
+        vesselsNode=nodes[0], cortexModel=nodes[1], calibrationPath=str(paths["camera.json"])
+    )
+
+
+def save(session, p, folder) -> Case:
+    """What the command `new` does with the exported inputs."""
+    options = session.export_inputs(p, folder / "exported")
+    values = dict(zip(options[::2], options[1::2]))
+    return Case.create(folder / "case", values["--vessels"], values["--cortex"], values["--camera"], values["--space"])
+
+
+def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
+    session, p = planned
+    assert session.steps(p)["case"].state is StepState.MISSING
+    p.casePath = str(tmp_path / "case")
+    assert session.steps(p)["case"].state is StepState.READY
+    case = save(session, p, tmp_path)
+    steps = session.steps(p)
+    assert (steps["case"].state, steps["microscope"].state) == (StepState.DONE, StepState.DONE)
+    expected_ras = cases.vessels().vertices_mm @ turned()[:3, :3].T + turned()[:3, 3]
+    np.testing.assert_allclose(case.vessels.vertices_mm * LPS, expected_ras, atol=1e-4)
+
+    p.vesselsNode.SetAndObserveTransformNodeID(None)
+    assert session.changed_models(p) == ("vessel model",)
+    assert session.steps(p)["case"].state is StepState.STALE
+
+    count = scene.GetNumberOfNodesByClass("vtkMRMLModelNode")
+    for _repeat in range(2):
+        assert adopt(session, p, scene) is not None
+        assert session.steps(p)["case"].state is StepState.DONE
+        assert scene.GetNumberOfNodesByClass("vtkMRMLModelNode") == count + 2
+
+
+def test_rendered_poses_are_those_that_were_planned(planned, tmp_path):
+    """The options for `render`, parsed and run by it, leave nothing outdated; another tilt does."""
+    from ExpectedAppearancesLib import cli
+
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    p.lateralAuto, p.lateralMm = False, 0.0
+    case = save(session, p, tmp_path)
+    assert cli.main(["render", str(case.folder), *session.render_arguments(p)]) == 0
+    assert session.steps(p)["poses"].state is StepState.DONE
+    p.tiltMaxDeg = 30.0
+    assert "the tilt" in session.steps(p)["poses"].text
+    # Opening the case takes over what it was rendered with.
+    other = parameters(casePath=p.casePath, poseCount=99)
+    scene = p.vesselsNode.GetScene()
+    adopt(session, other, scene)
+    assert (other.poseCount, other.tiltMaxDeg, other.lateralAuto, other.lateralMm) == (4, 50.0, False, 0.0)
+    assert other.craniotomySource is Where.FITTED
+    assert session.steps(other)["poses"].state is StepState.DONE
+
+
+def test_a_craniotomy_that_was_marked_is_kept_when_the_case_is_opened(scene, planned, tmp_path):
+    from ExpectedAppearancesLib import cli
+
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    case = save(session, p, tmp_path)
+    point = scene.AddNewNodeByClass("vtkMRMLMarkupsFiducialNode", "Craniotomy")
+    p.craniotomySource, p.craniotomyNode = Where.MARKED, point
+    assert "click on the cortex" in session.steps(p)["poses"].text
+    centre = case.vessels.centroid_mm + np.array([2.0, 0.0, 0.0])
+    point.AddControlPoint(*(centre * LPS))
+    first = session.sampler(p)
+    assert cli.main(["render", str(case.folder), *session.render_arguments(p)]) == 0
+    assert session.steps(p)["poses"].state is StepState.DONE
+    centre[0] += 1.0
+    point.SetNthControlPointPosition(0, *(centre * LPS))
+    assert session.sampler(p) is not first
+    assert "craniotomy" in session.steps(p)["poses"].text
+    other = parameters(casePath=p.casePath)
+    adopt(session, other, scene)
+    assert other.craniotomySource is Where.RECORDED
+    assert session.steps(other)["poses"].state is StepState.DONE
+
+
+def test_all_problems_of_a_case_are_told_at_once(planned, tmp_path):
+    session, p = planned
+    p.calibrationPath = str(tmp_path / "absent.json")
+    p.vesselsNode.SetAndObservePolyData(vtk.vtkPolyData())
+    found = "\n".join(session.problems_of_new_case(p, ""))
+    for words in ("choose one with New", "holds no surface", "absent.json"):
+        assert words in found
+    assert session.steps(p)["poses"].state is StepState.MISSING
+
+
+def test_textures_are_compared_with_what_was_synthesised(planned, tmp_path):
+    from ExpectedAppearancesLib.textures.library import read_texture, shipped_textures_folder
+
+    session, p = planned
+    files = session.texture_files(p)
+    assert len(files) == 10
+    assert set(session.chosen(p).textures.values()) == {""}  # not read yet
+    name, (version, image, labels) = next(iter(files.items()))
+    texture = read_texture(name, image, labels)
+    assert texture.sha256 != replace(texture, labels=np.maximum(texture.labels, 1)[::-1]).sha256
+    session.texture_digests[version] = texture.sha256
+    assert session.chosen(p).textures[name] == texture.sha256
+    p.texturesPath = str(tmp_path / "gone")
+    assert "no longer there" in session.steps(p)["textures"].text
+    assert session.textures_folder(parameters()) == shipped_textures_folder()
+
+
+def test_microscope_from_its_field_of_view(planned):
+    session, p = planned
+    p.cameraSource = Source.VIEW
+    camera = session.camera(p)
+    assert camera.width / camera.fx * 300.0 == pytest.approx(40.0)
+    assert read_camera(p.calibrationPath) == session.camera(parameters(calibrationPath=p.calibrationPath))
+
+
+def test_the_session_loads_nothing_heavy():
+    """In a fresh interpreter: what the panel imports when it is opened."""
+    import subprocess
+
+    code = (
+        "import sys; from ExpectedAppearancesLib.mrml import planning_session, planning_adopt, labelling, charts; "
+        "from ExpectedAppearancesLib.runs import runner, closing, dependencies; "
+        "from ExpectedAppearancesLib.model.presets import PRESETS; from ExpectedAppearancesLib.masks import stage; "
+        "session = planning_session.PlanningSession(); "
+        "print([m for m in ('torch', 'cv2', 'onnxruntime', 'skimage', 'scipy', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+KEEP_THE_CONTEXT = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import cases, numpy as np, vtk
+from ExpectedAppearancesLib.geometry.pose import look_at
+from ExpectedAppearancesLib.masks.renderer import MaskRenderer
+pose = look_at(np.array([0.0, 0.0, 100.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+renderer = MaskRenderer(cases.vessels(), cases.dome(), cases.camera())
+view = vtk.vtkRenderWindow()
+view.AddRenderer(vtk.vtkRenderer())
+view.Render()
+renderer.render(pose)
+renderer.render_surface(pose)
+print(bool(view.IsCurrent()))
+"""
+
+
+def test_drawing_a_label_map_leaves_the_views_context_current():
+    """Slicer's views and the label maps share one thread; a display is needed to have two contexts."""
+    import shutil
+    import subprocess
+    from pathlib import Path
+
+    if shutil.which("xvfb-run") is None:
+        pytest.skip("xvfb-run is not installed, and without a display there is one context only")
+    command = ["xvfb-run", "-a", sys.executable, "-c", KEEP_THE_CONTEXT, str(Path(__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout.split()[-1:] == ["True"], done.stdout + done.stderr

@@ -1,0 +1,272 @@
+"""The state of each planning step as a table, the verdict, and what is read from a case folder for them."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import replace
+
+import cases
+import numpy as np
+import pytest
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.case.recorded import CaseReader, training_state
+from ExpectedAppearancesLib.case.steps import (
+    STEPS,
+    Chosen,
+    Recorded,
+    StepState,
+    changes_of_poses,
+    next_step,
+    plan_steps,
+)
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.evaluation import metrics
+from ExpectedAppearancesLib.evaluation.verdict import Limits, figures_of_model, figures_of_study, verdict
+
+MISSING, READY, RUNNING, STALE, DONE = StepState
+CRANIOTOMY = {"centre_world_mm": [1.0, 2.0, 3.0], "outward_axis": [0.0, 0.0, 1.0], "up": [0.0, 1.0, 0.0]}
+RANGES = {
+    "tilt_max_deg": 50.0,
+    "roll_max_deg": 45.0,
+    "working_distance_mm": [80.0, 140.0],
+    "lateral_offset_mm": 5.0,
+    "in_view_min": 0.6,
+}
+POSES = {"poses": 100, "seed": 0, "ranges": RANGES, "craniotomy": CRANIOTOMY}
+MODEL = {
+    "plausible_view": {
+        "centre_world_mm": [1.0, 2.0, 3.0],
+        "outward_axis": [0.0, 0.0, 1.0],
+        "tilt_max_deg": 50.0,
+        "distance_mm": [80.0, 140.0],
+    }
+}
+SIX = {f"t{i}": f"sha{i}" for i in range(6)}
+
+
+def index(done=True, **settings):
+    items = [{"style": name, "texture_sha256": sha} for name, sha in SIX.items()]
+    return {"done": done, "settings": {"size_px": 384, "iterations": 50} | settings, "items": items}
+
+
+def finished() -> tuple[Chosen, Recorded]:
+    """A case in which everything is done."""
+    camera = cases.camera()
+    stages = {
+        "render": copy.deepcopy(POSES) | {"done": True},
+        "synthesize": {"done": True, "updated": "2026-01-01"},
+        "train": {"done": True, "updated": "2026-01-02", "preset": {"name": "quick"}, "appearances_sha256": "a"},
+    }
+    chosen = Chosen(
+        "/case",
+        True,
+        (),
+        camera,
+        "",
+        copy.deepcopy(POSES),
+        "",
+        dict(SIX),
+        "",
+        {"size_px": 384, "iterations": 50},
+        "quick",
+    )
+    recorded = Recorded("", {"stages": stages}, camera, index(), False, MODEL, "a", 0, "known", (True, ()))
+    return chosen, recorded
+
+
+def with_stage(recorded: Recorded, name: str, **values) -> Recorded:
+    stages = copy.deepcopy(recorded.manifest["stages"])
+    stages[name] = stages.get(name, {}) | values
+    return replace(recorded, manifest={"stages": stages})
+
+
+def without(recorded: Recorded, *names: str) -> Recorded:
+    stages = {key: value for key, value in recorded.manifest["stages"].items() if key not in names}
+    return replace(recorded, manifest={"stages": stages})
+
+
+def test_a_finished_case_is_done():
+    steps = plan_steps(*finished())
+    assert {name: step.state for name, step in steps.items()} == dict.fromkeys(STEPS, DONE), steps
+    assert next_step(steps) == "validation"
+
+
+def test_an_empty_panel_says_what_to_do_first():
+    steps = plan_steps(Chosen(camera_problem="Choose a calibration file."), Recorded())
+    assert next_step(steps) == "case"
+    assert "vessel model" in steps["case"].text
+    assert {steps[name].state for name in STEPS if name != "textures"} == {MISSING}
+    assert all(step.text for step in steps.values())
+
+
+MOVED = CRANIOTOMY | {"centre_world_mm": [1.0, 2.0, 4.0]}
+STEEPER = {**POSES, "ranges": RANGES | {"tilt_max_deg": 60.0}}
+
+
+@pytest.mark.parametrize(
+    ("change", "step", "state", "words"),
+    [
+        # Case
+        (lambda c, r: (replace(c, changed=("vessel model",)), r), "case", STALE, "vessel model"),
+        (lambda c, r: (replace(c, changed=("cortex model",)), r), "case", STALE, "cortex model"),
+        (lambda c, r: (replace(c, camera=cases.camera(128)), r), "case", STALE, "microscope"),
+        (lambda c, r: (replace(c, folder=""), Recorded()), "case", MISSING, "folder"),
+        (lambda c, r: (c, Recorded()), "case", READY, "save"),
+        (lambda c, r: (replace(c, camera=None), Recorded()), "case", MISSING, "microscope"),
+        (lambda c, r: (c, Recorded(problem="vessels.vtp: gone")), "case", MISSING, "vessels.vtp"),
+        # Microscope
+        (lambda c, r: (replace(c, camera=cases.camera(128)), r), "microscope", STALE, "Save"),
+        (lambda c, r: (replace(c, camera=None, camera_problem="x.json: bad"), r), "microscope", MISSING, "x.json"),
+        (lambda c, r: (c, Recorded()), "microscope", READY, "Given"),
+        # Poses
+        (lambda c, r: (replace(c, poses=STEEPER), r), "poses", STALE, "the tilt"),
+        (lambda c, r: (replace(c, poses=POSES | {"poses": 50}), r), "poses", STALE, "number of poses"),
+        (lambda c, r: (replace(c, poses=POSES | {"craniotomy": MOVED}), r), "poses", STALE, "craniotomy"),
+        (lambda c, r: (replace(c, poses=None, poses_problem="no view"), r), "poses", MISSING, "no view"),
+        (lambda c, r: (c, with_stage(r, "render", done=False)), "poses", READY, "stopped"),
+        (lambda c, r: (c, without(r, "render")), "poses", READY, "draw"),
+        (lambda c, r: (replace(c, running=frozenset({"render"})), r), "poses", RUNNING, "drawn"),
+        # Textures
+        (lambda c, r: (replace(c, textures={}), r), "textures", MISSING, "no textures"),
+        (lambda c, r: (replace(c, textures_problem="a.png: bad"), r), "textures", MISSING, "a.png"),
+        (lambda c, r: (replace(c, textures={"a": "", "b": ""}), r), "textures", DONE, "Only 2"),
+        # Appearances
+        (lambda c, r: (replace(c, textures=SIX | {"new": "x"}), r), "appearances", STALE, "new was added"),
+        (lambda c, r: (replace(c, textures=SIX | {"t1": "other"}), r), "appearances", STALE, "t1 was changed"),
+        (lambda c, r: (replace(c, textures=SIX | {"t1": ""}), r), "appearances", DONE, "6"),
+        (lambda c, r: (replace(c, synthesis={"size_px": 256}), r), "appearances", STALE, "size"),
+        (lambda c, r: (c, replace(r, overview_changed=True)), "appearances", STALE, "craniotomy"),
+        (lambda c, r: (c, replace(r, index=None)), "appearances", READY, "start"),
+        (lambda c, r: (c, replace(r, index=index(done=False))), "appearances", READY, "goes on"),
+        (lambda c, r: (c, without(r, "render")), "appearances", MISSING, "label maps"),
+        (lambda c, r: (replace(c, running=frozenset({"synthesize"})), r), "appearances", RUNNING, "made"),
+        # Training
+        (lambda c, r: (c, replace(r, appearances_sha256="b")), "training", STALE, "expected appearances"),
+        (lambda c, r: (replace(c, preset="best"), r), "training", STALE, "quick"),
+        (lambda c, r: (c, with_stage(r, "train", done=False)), "training", READY, "start"),
+        (lambda c, r: (c, with_stage(replace(r, steps_trained=70), "train", done=False)), "training", READY, "step 70"),
+        (lambda c, r: (c, replace(r, model=None)), "training", MISSING, "gone"),
+        (lambda c, r: (c, replace(r, index=index(done=False))), "training", MISSING, "appearances first"),
+        (lambda c, r: (replace(c, running=frozenset({"train"})), r), "training", RUNNING, "trained"),
+        # Validation
+        (lambda c, r: (c, replace(r, verdict=(False, ("a", "b")))), "validation", MISSING, "2 limits"),
+        (lambda c, r: (c, replace(r, validation="stale")), "validation", STALE, "older"),
+        (lambda c, r: (c, replace(r, verdict=None, model=None)), "validation", MISSING, "Train"),
+    ],
+)
+def test_each_step_says_what_it_lacks(change, step, state, words):
+    found = plan_steps(*change(*finished()))[step]
+    assert (found.state, words in found.text) == (state, True), found
+
+
+def test_what_rests_on_an_outdated_step_is_outdated():
+    chosen, recorded = finished()
+    steps = plan_steps(replace(chosen, poses=STEEPER), recorded)
+    assert {name: steps[name].state for name in ("appearances", "training", "validation")} == dict.fromkeys(
+        ("appearances", "training", "validation"), STALE
+    )
+    assert "the poses" in steps["appearances"].text
+    assert steps["textures"].state is DONE
+    # Rendered anew with other poses, the model is still the old one.
+    recorded = with_stage(recorded, "render", **STEEPER)
+    assert "the poses" in plan_steps(replace(chosen, poses=STEEPER), recorded)["training"].text
+
+
+def test_older_cases_are_judged_by_time():
+    chosen, recorded = finished()
+    recorded = with_stage(recorded, "train", appearances_sha256=None)
+    assert plan_steps(chosen, recorded)["training"].state is DONE
+    recorded = with_stage(recorded, "synthesize", updated="2026-01-03")
+    assert plan_steps(chosen, recorded)["training"].state is STALE
+
+
+def test_rounding_in_a_field_is_no_change():
+    rounded = copy.deepcopy(POSES)
+    rounded["ranges"]["working_distance_mm"] = [80.04, 139.96]
+    assert changes_of_poses(rounded, POSES) == []
+    rounded["ranges"]["working_distance_mm"] = [80.2, 140.0]
+    assert changes_of_poses(rounded, POSES) == ["the working distance"]
+
+
+def summary(add_mm: float, share: float) -> dict:
+    errors = metrics.FrameErrors(*(np.full(10, add_mm) for _ in range(5)), np.arange(10) < 10 * share)
+    return metrics.summary(errors)
+
+
+def study() -> dict:
+    loto = {"per_style": {"a": summary(1.0, 1.0)}, "all": summary(1.0, 1.0)}
+    strict = {"per_style": {"a": summary(2.0, 0.9), "b": summary(4.0, 0.7)}, "all": summary(2.5, 0.8)}
+    return {"format": "ExpectedAppearances study", "protocols": {"loto": loto, "strict": strict}}
+
+
+def test_verdict_rests_on_the_strict_test():
+    rows = figures_of_study(study()) + figures_of_model({"validation": {"add_mm_mean": 9.0}})
+    assert [(row.protocol, row.style) for row in rows[:3]] == [("strict", ""), ("strict", "a"), ("strict", "b")]
+    assert rows[0].accepted == pytest.approx(0.8)
+    assert verdict(rows, Limits(3.0, 0.8, 1.0)) == (True, ())
+    ready, reasons = verdict(rows, Limits(2.0, 0.9, 1.0))
+    assert not ready
+    assert ["2.50 mm" in reasons[0], "80 % accepted" in reasons[1]] == [True, True]
+
+
+def test_verdict_on_the_models_own_validation():
+    rows = figures_of_model(
+        {"validation": {"add_mm_mean": 1.2, "add_mm_median": 1.0, "add_below_3mm": 0.95, "accepted_of_true": 0.4}}
+    )
+    assert verdict(rows, Limits()) == (False, ("40 % accepted, at least 50 % wanted",))
+    assert verdict([], Limits()) is None
+    unknown = figures_of_model({"validation": {"add_mm_mean": None, "steps": 3}})
+    assert len(verdict(unknown, Limits())[1]) == 3  # what was not measured is not met
+
+
+def test_a_damaged_study_is_refused():
+    with pytest.raises(InputError, match="not the figures of a study"):
+        figures_of_study({"format": "other"})
+    broken = study()
+    del broken["protocols"]["strict"]["all"]["add_mm"]
+    with pytest.raises(InputError, match="add_mm"):
+        figures_of_study(broken)
+
+
+@pytest.fixture
+def case(tmp_path):
+    inputs = cases.write_inputs(tmp_path)
+    return Case.create(tmp_path / "case", inputs["vessels.vtp"], inputs["cortex.vtp"], inputs["camera.json"])
+
+
+def test_reader_sees_what_changes_and_reads_meshes_once(case):
+    reader = CaseReader()
+    folder = str(case.folder)
+    assert reader.case("") == (None, "")
+    assert reader.case(folder + "x") == (None, "")
+    first = reader.case(folder)[0]
+    vessels = first.vessels
+    case.record("train", done=True, appearances_sha256="a")
+    second = reader.case(folder)[0]
+    assert second.manifest["stages"]["train"]["done"]
+    assert second.vessels is vessels
+    files.write_json(case.model_folder / "model.json", {"validation": {"add_mm_mean": 1.0, "add_below_3mm": 1.0}})
+    recorded = reader.recorded(folder, "surface", Limits())
+    assert recorded.model
+    assert recorded.verdict == (False, ("unknown accepted, at least 50 % wanted",))
+    files.write_json(case.folder / "study" / "study.json", study() | {"inputs": {"appearances_sha256": "b"}})
+    assert reader.recorded(folder, "surface", Limits()).validation == "stale"
+    (case.folder / "vessels.vtp").write_text("other")
+    files.write_json(case.folder / "case.json", json.loads((case.folder / "case.json").read_text()) | {"created": ""})
+    assert "SHA-256" in reader.recorded(folder, "surface", Limits()).problem
+
+
+def test_training_state_is_read_without_torch(tmp_path):
+    torch = pytest.importorskip("torch")
+    from safetensors.torch import save_file
+
+    state = {"step": 70, "curve": [{"step": 60, "loss": -1.0, "validation_add_mm": 2.0}]}
+    path = tmp_path / "checkpoint.safetensors"
+    save_file({"a": torch.zeros(3)}, str(path), metadata={"state": json.dumps(state)})
+    assert training_state(path) == state
+    path.write_bytes(path.read_bytes()[:20])
+    assert training_state(path) == {}
+    assert training_state(tmp_path / "absent") == {}
