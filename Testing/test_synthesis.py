@@ -12,6 +12,7 @@ from ExpectedAppearancesLib.appearances.measure import GramMeasure
 from ExpectedAppearancesLib.appearances.synthesis import Job, Synthesizer, _start
 from ExpectedAppearancesLib.appearances.vgg import load_vgg
 from ExpectedAppearancesLib.appearances.workload import (
+    BYTES_PER_PIXEL,
     bytes_per_image,
     fine_and_coarse,
     images_at_once,
@@ -180,8 +181,28 @@ def test_directions_are_those_of_the_two_loop_recursion(history):
         gradient = points.double() @ torch.from_numpy(matrix) - torch.from_numpy(offset)
         return torch.zeros(1), gradient.float()
 
-    minimise(value_and_gradient, torch.zeros(1, 30), 11, history, first_step=0.1)
+    minimise(value_and_gradient, torch.zeros(1, 30), 11, history, first_step=0.1, patience=100)
     np.testing.assert_allclose(ours, visited, atol=2e-4)
+
+
+def test_each_problem_stops_where_it_gains_nothing_more():
+    seen = []
+
+    def loss(x):
+        seen.append(x.detach().clone())
+        falls = (x[:1] - 40).abs().sum(dim=1)  # by a full step each time, for long
+        rests = (x[1:] - 1).square().sum(dim=1) + 1
+        return torch.cat([falls, rests])
+
+    _, values = minimise(with_gradient(loss), torch.zeros(2, 3), 40, largest_step=0.5, patience=4)
+    points = torch.stack(seen)
+    assert values[1] == pytest.approx(1.0, abs=1e-3)
+    moved = (points[1:, 1] - points[:-1, 1]).abs().sum(dim=1)
+    assert (moved[-20:] == 0).all() and (moved[:2] > 0).all()
+    assert (points[1:, 0] != points[:-1, 0]).any(dim=1).all()
+    alone = []
+    minimise(with_gradient(lambda x: alone.append(1) or x.square().sum(dim=1) + 1), torch.ones(1, 3), 40, patience=4)
+    assert len(alone) < 20
 
 
 def test_one_hopeless_problem_does_not_spoil_its_neighbour():
@@ -327,6 +348,6 @@ def test_batch_follows_the_memory_that_is_free(monkeypatch):
     each = bytes_per_image((96, 96), 40)
     assert each > 96 * 96 * 3 * 4 * 2 * 40  # below 128 px the history is that of all iterations
     assert with_free(1 << 40) == 14  # 2^17 px go through the network at once
-    network = 2600 * 2**17
+    network = BYTES_PER_PIXEL * 2**17
     assert with_free(network + 2 * 5 * each + each) == 5
     assert with_free(1 << 20) == 1

@@ -18,15 +18,18 @@ def minimise(
     history: int = 100,
     first_step: float = 1.0,
     largest_step: float = 20.0,
+    tolerance: float = 1e-4,
+    patience: int = 10,
     after_iteration: Callable[[int, torch.Tensor], None] | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Minimise a loss of x[b] for all b at once; value_and_gradient maps (B, ...) to the losses (B,) and (B, ...),
     without mixing images.
 
     Full steps without a line search, as the authors' optimiser; the first one moves x by `first_step` (root mean
-    square), none by more than `largest_step`.
+    square), none by more than `largest_step`. A problem stops where `patience` iterations have not lowered its loss
+    by `tolerance` of it; the others go on.
     Returns the best x seen (B, ...) and its loss (B,). One evaluation per iteration, and one for the last point.
-    Nothing here waits for the device.
+    Nothing here waits for a GPU.
     """
     shape = start.shape
     x = _padded(start.detach())
@@ -34,16 +37,19 @@ def minimise(
     memory = _History(x, min(history, iterations))
     best, best_loss = x.clone(), torch.full((shape[0],), float("inf"), device=x.device)
     scale = torch.ones((shape[0], 1), dtype=torch.float64, device=x.device)
+    stalled = torch.zeros((shape[0], 1), dtype=torch.int32, device=x.device)
     previous_gradient = step = None
     for iteration in range(iterations + 1):
         values, gradient = value_and_gradient(x[:, :size].reshape(shape))
         values, gradient = values.detach(), _padded(torch.nan_to_num(gradient.detach()))
         better = values < best_loss
+        stalled = torch.where((values < (1 - tolerance) * best_loss)[:, None], 0, stalled + 1)
+        going = stalled < patience
         best_loss = torch.where(better, values, best_loss)
         best = torch.where(better[:, None], x, best)
         if after_iteration is not None:
             after_iteration(iteration, values)
-        if iteration == iterations:
+        if iteration == iterations or (x.device.type == "cpu" and not going.any()):
             break
         squares = _dots(gradient, gradient)
         if step is None:
@@ -56,7 +62,7 @@ def minimise(
             direction = torch.where(slope >= 0, gradient * -scale.float(), direction)
         length = (_dots(direction, direction) / size).sqrt().clamp_min(1e-30)
         direction *= (largest_step / length).clamp(max=1.0).float()
-        previous_gradient, step = gradient, direction
+        previous_gradient, step = gradient, torch.where(going, direction, 0.0)
         x = x + step
     return best[:, :size].reshape(shape), best_loss
 

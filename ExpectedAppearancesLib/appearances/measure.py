@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 
@@ -27,6 +30,10 @@ class GramMeasure:
         """By class name: the squared distance of the Grams of RGB uint8 (H, W, 3) inside the class to the texture's,
         over the squared norm of the texture's, summed over the five layers. Classes not shown are left out.
         """
+        with _without_tf32():
+            return self._distances(image_rgb, labels, texture)
+
+    def _distances(self, image_rgb: np.ndarray, labels: np.ndarray, texture: Texture) -> dict[str, float]:
         device = self.vgg.conv1_1_weight.device
         targets = self._target(texture, *labels.shape)
         masks = self.vgg.carry_masks(class_masks(torch.from_numpy(labels)[None].to(device), CLASSES))
@@ -48,3 +55,17 @@ class GramMeasure:
             while len(self._targets) > KEPT_TEXTURES:
                 del self._targets[next(iter(self._targets))]
         return self._targets[key]
+
+
+@contextlib.contextmanager
+def _without_tf32() -> Iterator[None]:
+    """On CUDA fp32 may mean TF32, which has bf16's precision nearly; a measure must not."""
+    flags = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [flag.allow_tf32 for flag in flags]
+    try:
+        for flag in flags:
+            flag.allow_tf32 = False
+        yield
+    finally:
+        for flag, value in zip(flags, before):
+            flag.allow_tf32 = value

@@ -13,9 +13,9 @@ FINE_SHARE = 0.4
 LEAST_COARSE_PX = 64
 PIXELS_AT_ONCE = 2**17  # through the network on a processor: larger tensors are given anew by the system every time
 SHARE_OF_FREE = 0.5  # others compute here too
-# Measured with `torch.cuda.max_memory_allocated`'s equivalent on a processor (peak resident memory): the history of
-# L-BFGS, 2 x 3 x 4 bytes a pixel and pair, and besides it about this much; it does not depend on the texture.
-BYTES_PER_PIXEL = 2600
+# Peak resident memory of one image of 256 px besides the history of L-BFGS (2 x 3 x 4 bytes a pixel and pair) was
+# 2,350 bytes a pixel in bf16; fp32 takes twice that.
+BYTES_PER_PIXEL = 4700
 VECTORS = 12  # of an image's size, in fp32, that an iteration holds besides the history
 
 

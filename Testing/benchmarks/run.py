@@ -15,7 +15,7 @@ from pathlib import Path
 # out. Each runs in a process of its own: VTK and torch's threads do not meet, and memory is its own.
 STAGES = ("masks", "synthesis", "synthesis_scaling", "surface_views", "training", "registration", "live_update")
 HERE = Path(__file__).parent
-LIMIT_S = 600
+LIMIT_S = 900
 
 
 def main() -> int:

@@ -32,6 +32,7 @@ from ExpectedAppearancesLib.masks.stage import read_rendered, render_case
 from ExpectedAppearancesLib.textures.library import Texture, read_library, shipped_textures_folder
 
 ROUNDS = {128: 3, 256: 2}
+BUDGET_S = 120  # for each size; on a busy computer one round must do
 SQUARE = 3072
 
 
@@ -64,7 +65,10 @@ def _side_by_side(
         labels.shape, synthesizer.vgg.backbone, [float((labels == c).mean()) for c in CLASSES], DEFAULT_ITERATIONS
     )
     own, plain, shares, distances, peaks = [], [], [], [], {"own": 0.0, "plain": 0.0}
+    start = time.monotonic()
     for turn in range(ROUNDS[size]):
+        if turn and time.monotonic() - start > BUDGET_S:
+            break
         texture = textures[turn % len(textures)]
         image, texture_labels = resized(texture, *labels.shape)
         synthesizer._target(texture, *labels.shape)  # once for a texture, however many images: not an image's cost
@@ -93,6 +97,7 @@ def _side_by_side(
         "peak_memory_mb": round(peaks["own"]),
         "reference_peak_memory_mb": round(peaks["plain"]),
         "batch": batch,
+        "rounds": len(own),
     }
 
 
