@@ -119,7 +119,7 @@ class ClassGramLoss:
         # On a processor each image has its own lists of pixels; on a GPU one list, filled up, saves launches.
         self._per_image = labels.device.type == "cpu"
         self._terms = []
-        for masks, target in zip(vgg.carry_masks(class_masks(labels, classes)), targets, strict=True):
+        for masks, target in zip(vgg.carry_masks(class_masks(labels, classes)), targets):
             groups = [slice(b, b + 1) for b in range(len(labels))] if self._per_image else self._parts
             self._terms.append(
                 [
@@ -175,7 +175,7 @@ def texture_grams(
     """Targets of one texture: per layer (C, K, K); NaN for a class that the texture does not show."""
     grams = []
     masks = vgg.carry_masks(class_masks(labels[None], classes))
-    for features, mask in zip(vgg(image[None]), masks, strict=True):
+    for features, mask in zip(vgg(image[None]), masks):
         layer = torch.cat([class_gram(features, mask[:, c]) for c in range(mask.shape[1])])
         missing = torch.tensor([not bool((labels == c).any()) for c in classes], device=layer.device)
         layer[missing] = float("nan")

@@ -125,7 +125,7 @@ def _make(shard: Shard, recipe: Recipe, waiting: list[dict], claim, on_progress:
             claim.keep()
             on_progress(made + share * len(part))
 
-        for item, job, image in zip(part, jobs, synthesizer.run(jobs, report), strict=True):
+        for item, job, image in zip(part, jobs, synthesizer.run(jobs, report)):
             distances = {name: round(d, 4) for name, d in measure.distances(image, job.labels, shard.texture).items()}
             claim.check()
             files.write_png(folder / item["image"], image)

@@ -76,7 +76,7 @@ class Synthesizer:
         labels = torch.from_numpy(np.stack([job.labels for job in jobs])).to(self.device)
         if labels.shape[1:] != size:
             labels = F.interpolate(labels[:, None].float(), size, mode="nearest")[:, 0].byte()
-        targets = [torch.stack(t) for t in zip(*(self._target(job.texture, *size) for job in jobs), strict=True)]
+        targets = [torch.stack(t) for t in zip(*(self._target(job.texture, *size) for job in jobs))]
         at_once = PIXELS_AT_ONCE if self.device.type == "cpu" else None
         loss = ClassGramLoss(self.vgg, labels, targets, CLASSES, at_once)
         inside = (labels > 0)[:, None].float()

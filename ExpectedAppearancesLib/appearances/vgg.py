@@ -190,7 +190,7 @@ def _from_torchvision(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tenso
     counts = (2, 2, 3, 3, 3) if len(indices) == 13 else (2, 2, 4, 4, 4)
     names = [f"conv{block + 1}_{k + 1}" for block, count in enumerate(counts) for k in range(count)]
     converted = {}
-    for name, index in zip(names, indices, strict=False):
+    for name, index in zip(names, indices):
         converted[f"{name}.weight"] = tensors[f"features.{index}.weight"].float()
         converted[f"{name}.bias"] = tensors[f"features.{index}.bias"].float()
     scale = 255 * torch.tensor([0.229, 0.224, 0.225])

@@ -55,7 +55,7 @@ def operations_per_evaluation(shape: tuple[int, int], backbone: str, class_share
     down to the image, and the Gram matrices and their gradients on each class's share of the pixels. What is
     proportional to pixels times channels only (relu, pools, L-BFGS) is left out."""
     pixels, operations, before = float(shape[0] * shape[1]), 0.0, 3
-    for block, (count, width) in enumerate(zip(CONVOLUTIONS[backbone], WIDTHS, strict=True)):
+    for block, (count, width) in enumerate(zip(CONVOLUTIONS[backbone], WIDTHS)):
         if block:
             pixels /= 4
         for _ in range(count):

@@ -29,7 +29,7 @@ def _shuffled(image: np.ndarray, rng) -> np.ndarray:
     side = len(image) // parts
     tiles = [(r * side, c * side) for r in range(parts) for c in range(parts)]
     result = image.copy()
-    for (row, column), k in zip(tiles, rng.permutation(len(tiles)), strict=True):
+    for (row, column), k in zip(tiles, rng.permutation(len(tiles))):
         tile = image[tiles[k][0] : tiles[k][0] + side, tiles[k][1] : tiles[k][1] + side]
         result[row : row + side, column : column + side] = np.rot90(tile, rng.integers(4))
     return result

@@ -200,7 +200,7 @@ def _tube(centre_line_mm: np.ndarray, radius_mm: float) -> Mesh:
     angle = np.linspace(0, 2 * np.pi, RING_VERTICES, endpoint=False)[:, None]
     cap = np.radians([60.0, 30.0])
     centres, radii, frames = [], [], []
-    for i, (point, tangent) in enumerate(zip(centre_line_mm, tangents, strict=True)):
+    for i, (point, tangent) in enumerate(zip(centre_line_mm, tangents)):
         across = across - tangent * (across @ tangent)
         across /= np.linalg.norm(across)
         ends = [(0.0, 1.0)]
@@ -212,9 +212,7 @@ def _tube(centre_line_mm: np.ndarray, radius_mm: float) -> Mesh:
             centres.append(point + shift * radius_mm * tangent)
             radii.append(scale * radius_mm)
             frames.append((across, np.cross(tangent, across)))
-    rings = [
-        c + r * (np.cos(angle) * f + np.sin(angle) * s) for c, r, (f, s) in zip(centres, radii, frames, strict=True)
-    ]
+    rings = [c + r * (np.cos(angle) * f + np.sin(angle) * s) for c, r, (f, s) in zip(centres, radii, frames)]
     tips = [centre_line_mm[0] - radius_mm * tangents[0], centre_line_mm[-1] + radius_mm * tangents[-1]]
     vertices = np.vstack([*rings, *tips])
     k = np.arange(RING_VERTICES)

@@ -112,12 +112,12 @@ class ViewMemory:
         chosen = fresh + [self._views[i] for i in again]
         if len(fresh) < self._batch:
             self._views = (self._views + fresh)[-self._remembered :]
-        return Batch(*(np.stack(parts) for parts in zip(*chosen, strict=True)))
+        return Batch(*(np.stack(parts) for parts in zip(*chosen)))
 
     def _draw(self) -> list[tuple[np.ndarray, ...]]:
         self.drawn += 1
         batch = self._feeder.next()
-        return list(zip(*vars(batch).values(), strict=True))
+        return list(zip(*vars(batch).values()))
 
 
 def draw_views(case_folder: Path, settings: ViewSettings, count: int, workers: int = 1) -> Batch:

@@ -311,7 +311,7 @@ class _Trainer:
             LARGEST_COUNTED_ADD_MM
             if r.camera_from_world is None
             else min(float(add_mm(vertices, true[None], r.camera_from_world[None])[0]), LARGEST_COUNTED_ADD_MM)
-            for r, true in zip(readings, batch.camera_from_world, strict=True)
+            for r, true in zip(readings, batch.camera_from_world)
         ]
         return np.array(errors)
 
