@@ -158,7 +158,7 @@ def _run_plain(scene, view, phantom, poses, frames, update_ms: list) -> None:
         case = Case.open(phantom.case.folder)
         prediction = Predictor(case.model_folder).predict(frame)
         predicted = prediction.camera_from_world
-        nodes = scene.GetNumberOfNodes()
+        before = set(_nodes(scene))
         plane_mm = scenes.plane_depth_mm(case.vessels, predicted)
         to_ras = camera_to_ras(predicted, case.space)
         transform = scenes.add_camera_transform(scene, to_ras)
@@ -171,8 +171,13 @@ def _run_plain(scene, view, phantom, poses, frames, update_ms: list) -> None:
         view.window.Render()
         update_ms.append((time.perf_counter() - begin) * 1000)
         _check(phantom, pose, predicted)
-        while scene.GetNumberOfNodes() > nodes:
-            scene.RemoveNode(scene.GetNthNode(scene.GetNumberOfNodes() - 1))
+        for node in _nodes(scene):
+            if node not in before and scene.IsNodePresent(node):
+                scene.RemoveNode(node)
+
+
+def _nodes(scene) -> list:
+    return [scene.GetNthNode(i) for i in range(scene.GetNumberOfNodes())]
 
 
 def _check(phantom, true: np.ndarray, predicted: np.ndarray | None) -> None:
