@@ -107,6 +107,7 @@ def test_three_hundred_frames_each_with_its_own_pose_and_nothing_left_over(appli
     stream = node_with(scene, images[0])
     controller = LiveController(scene, views)
     controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)  # what the stream held at the start
     counts, resident = [], []
     for number in range(300):
         if number % 25 == 24:
