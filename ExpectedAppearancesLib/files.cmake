@@ -143,6 +143,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/painting.py
   ExpectedAppearancesLib/textures/proposal.py
   ExpectedAppearancesLib/widgets/__init__.py
+  ExpectedAppearancesLib/widgets/labels.py
   ExpectedAppearancesLib/widgets/live_align.py
   ExpectedAppearancesLib/widgets/live_install.py
   ExpectedAppearancesLib/widgets/live_layout.py

@@ -30,14 +30,12 @@ class SurfacePainter:
 
     def __init__(self, vessels, parenchyma, appearances: list[Appearance]):
         self._overviews = appearances
-        self._images: dict[Path, np.ndarray] = {}
         self._plates: dict[Path, np.ndarray] = {}
         self.camera: Camera = self._overviews[0].camera
         self.camera_from_world = self._overviews[0].camera_from_world.astype(np.float32)
         with MaskRenderer(vessels, parenchyma, self.camera) as renderer:
             labels, _, points = renderer.render_surface(self.camera_from_world)
         self._normals = _normals(points, labels, self.camera_from_world)
-        self.extent_px = float(np.sqrt((labels != BACKGROUND).sum()))
 
     def overview_px(self, points_mm: np.ndarray) -> np.ndarray:
         """Where in the overview the surface points (H, W, 3), world mm, lie: (H, W, 2) float32, px."""
@@ -57,9 +55,9 @@ class SurfacePainter:
         """uint8 RGB (H, W, 3) of what `camera_from_world` sees; textures, light and focus drawn from `rng`."""
         overview = self._overviews[rng.integers(len(self._overviews))]
         other = self._overviews[rng.integers(len(self._overviews))] if rng.uniform() < MIX_STYLES else overview
-        vessels = _look_up(self._image(other), where_px)
+        vessels = _look_up(other.image, where_px)
         if rng.uniform() < REGISTERED:
-            image = vessels if other is overview else _look_up(self._image(overview), where_px)
+            image = vessels if other is overview else _look_up(overview.image, where_px)
         else:
             # No two views share their parenchyma's pattern: where the vessels run is all that tells the pose.
             image = _look_up(self._plate(overview), _elsewhere(where_px, rng))
@@ -72,14 +70,9 @@ class SurfacePainter:
         """Parenchyma of a random texture, uint8 RGB: cortex that is nowhere on the case's surface."""
         return self._plate(self._overviews[rng.integers(len(self._overviews))])
 
-    def _image(self, appearance: Appearance) -> np.ndarray:
-        if appearance.image_path not in self._images:
-            self._images[appearance.image_path] = files.read_image_rgb(appearance.image_path)
-        return self._images[appearance.image_path]
-
     def _plate(self, overview: Appearance) -> np.ndarray:
         if overview.image_path not in self._plates:
-            plate = parenchyma_plate(self._image(overview), files.read_label_map(overview.labels_path))
+            plate = parenchyma_plate(overview.image, files.read_label_map(overview.labels_path))
             self._plates[overview.image_path] = plate
         return self._plates[overview.image_path]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,11 @@ class Appearance:
     camera: Camera
     camera_from_world: np.ndarray
     gram_distance: float  # to the texture, both classes together (measure.GramMeasure)
+
+    @cached_property
+    def image(self) -> np.ndarray:
+        """uint8 RGB (H, W, 3), read once."""
+        return files.read_image_rgb(self.image_path)
 
 
 def folder_of(case: Case, method: str) -> Path:

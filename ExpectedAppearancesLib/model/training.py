@@ -74,7 +74,6 @@ def train_case(
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
     folder = fold.folder if fold else case.model_folder
     trainer = _Trainer(case, preset, encoding, device, seed, views, folder)
-    made_from = files.sha256(folder_of(case, method) / "index.json")
     progress(0.0, "rendering validation views")
     workers = max(1, (os.cpu_count() or 2) - 1)
     validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
@@ -93,7 +92,7 @@ def train_case(
             done=True,
             validation=figures,
             method=method,
-            appearances_sha256=made_from,
+            appearances_sha256=trainer.appearances_sha256,
             model_sha256=model_sha256,
         )
     return figures
@@ -137,8 +136,8 @@ class _Trainer:
         self.plausible = PlausibleView(
             craniotomy.centre_world_mm, craniotomy.outward_axis, ranges.tilt_max_deg, tuple(distance)
         )
-        appearances = files.sha256(folder_of(case, views.method) / "index.json")
-        identity = f"{preset.to_dict()} {seed} {views} {appearances} {ranges}"
+        self.appearances_sha256 = files.sha256(folder_of(case, views.method) / "index.json")
+        identity = f"{preset.to_dict()} {seed} {views} {self.appearances_sha256} {ranges}"
         self.state = {
             "settings": {"sha256": hashlib.sha256(identity.encode()).hexdigest()},
             "step": 0,

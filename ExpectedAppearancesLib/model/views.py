@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .. import files
 from ..appearances.projection import SurfacePainter
 from ..appearances.store import Appearance, read_appearances
 from ..augmentation import elastic, microscope
@@ -74,7 +73,6 @@ class ViewSource:
         self._sampler: PoseSampler = sampler_of(self.case, settings.seed)
         _, appearances = read_appearances(self.case, settings.method)
         self._appearances = [a for a in appearances if a.style in settings.styles]
-        self._images: dict[Path, np.ndarray] = {}
         self._poses = known_poses(Path(settings.poses_file)) if settings.poses_file else None
         if self._poses is not None and settings.method == "image":
             self._appearances = [a for a in self._appearances if seen_from(a, self._poses)]
@@ -111,18 +109,13 @@ class ViewSource:
             pose = pose_from_rotation(turn, np.zeros(3)) @ appearance.camera_from_world
             labels, _, points = self._renderer.render_surface(pose)
             image = self._turned(appearance, turn)
-            cortex = self._image(appearance)
+            cortex = appearance.image
         hidden = opening(cv2.transform(points, self._frontal), self._middle_mm, self._extent_mm, rng)
         if hidden is not None:
             labels *= hidden
         self._clear_bars(labels, 1)
         image = fill_outside(image, labels == BACKGROUND, cortex, rng)
         return self._finish(image, pose, labels, points, rng)
-
-    def _image(self, appearance: Appearance) -> np.ndarray:
-        if appearance.image_path not in self._images:
-            self._images[appearance.image_path] = files.read_image_rgb(appearance.image_path)
-        return self._images[appearance.image_path]
 
     def close(self) -> None:
         self._renderer.close()
@@ -143,7 +136,7 @@ class ViewSource:
     def _turned(self, appearance: Appearance, turn: np.ndarray) -> np.ndarray:
         homography = self._large.matrix @ turn @ np.linalg.inv(appearance.camera.matrix)
         size = (self._large.width, self._large.height)
-        return cv2.warpPerspective(self._image(appearance), homography, size, flags=cv2.INTER_LINEAR)
+        return cv2.warpPerspective(appearance.image, homography, size, flags=cv2.INTER_LINEAR)
 
     def _finish(self, image, pose, labels, points, rng) -> View:
         size = self.settings.size_px

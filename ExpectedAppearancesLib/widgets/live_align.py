@@ -9,6 +9,7 @@ from slicer.i18n import tr as _
 from ..errors import InputError
 from ..mrml.live_align import add_landmark_lists
 from ..mrml.live_controller import LiveController
+from .labels import set_text
 
 SLIDERS = ("shiftX", "shiftY", "shiftZ", "turnX", "turnY", "turnZ")
 
@@ -109,7 +110,7 @@ class AlignSection:
         pairs = min(counts)
         self._ui.solveButton.enabled = pairs >= 4 and counts[0] == counts[1]
         text = _("{frame} in the frame, {mesh} on the vessels; at least 4 of each are needed, in the same order.")
-        self._set(self._ui.landmarksLabel, text.format(frame=counts[0], mesh=counts[1]))
+        set_text(self._ui.landmarksLabel, text.format(frame=counts[0], mesh=counts[1]))
 
     def _solve(self) -> None:
         try:
@@ -126,12 +127,12 @@ class AlignSection:
         self._ui.saveTruthButton.enabled = self._controller.truth is not None
         difference = self._controller.difference()
         if difference is None:
-            self._set(self._ui.differenceLabel, "")
+            set_text(self._ui.differenceLabel, "")
             return
         text = _(
             "Predicted (blue) from true (green): ADD {add} mm, reprojection {px} px, rotation {deg}°, shift {mm} mm"
         )
-        self._set(
+        set_text(
             self._ui.differenceLabel,
             text.format(
                 add=f"{difference.add_mm:.2f}",
@@ -164,10 +165,5 @@ class AlignSection:
         for slider in self._sliders:
             slider.value = 0.0
         self._moving_sliders = False
-        self._set(self._ui.landmarksLabel, _("No landmarks yet; 4 pairs are needed."))
+        set_text(self._ui.landmarksLabel, _("No landmarks yet; 4 pairs are needed."))
         self._ui.solveButton.enabled = False
-
-    @staticmethod
-    def _set(label, text: str) -> None:
-        if label.text != text:
-            label.text = text

@@ -14,6 +14,7 @@ from ..live.trust import controls
 from ..mrml.live_controller import IDLE, LiveController
 from ..mrml.live_scene import OverlayOptions
 from . import live_install
+from .labels import set_text
 from .live_align import AlignSection
 from .live_layout import LayoutSection
 from .live_record import RecordSection
@@ -206,14 +207,11 @@ class LivePanel:
         ):
             if widget.enabled != enabled:
                 widget.enabled = enabled
-        text = _("Stop") if running else _("Start")
-        if ui.startButton.text != text:
-            ui.startButton.text = text
+        set_text(ui.startButton, _("Stop") if running else _("Start"))
         if ui.freezeButton.checked != self.controller.frozen:
             ui.freezeButton.checked = self.controller.frozen
         single = _("Next frame") if running and self.controller.frozen else _("Single frame")
-        if ui.singleButton.text != single:
-            ui.singleButton.text = single
+        set_text(ui.singleButton, single)
 
     def _remember_camera(self) -> None:
         """A of the frame on the screen, in the parameter node: a scene does not save a view's window centre."""

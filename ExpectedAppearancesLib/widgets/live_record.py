@@ -10,6 +10,7 @@ from slicer.i18n import tr as _
 from ..errors import InputError
 from ..mrml import live_record
 from ..mrml.live_controller import LiveController, Status
+from .labels import set_text
 
 
 class RecordSection:
@@ -37,10 +38,9 @@ class RecordSection:
         ui.recordButton.enabled = can_record or recording
         if recording:
             text = _("● {frames} frames, {mb} MB").format(frames=recorder.frames, mb=round(recorder.mb))
-            if ui.recordLabel.text != text:
-                ui.recordLabel.text = text
-        elif ui.recordLabel.text:
-            ui.recordLabel.text = ""
+            set_text(ui.recordLabel, text)
+        else:
+            set_text(ui.recordLabel, "")
         browser = self._browser()
         ui.exportButton.enabled = browser is not None and not recording
         ui.replaySlider.enabled = browser is not None and not self._controller.running

@@ -6,6 +6,7 @@ from slicer.i18n import tr as _
 
 from ..mrml.live_controller import Status
 from . import live_texts
+from .labels import set_text
 
 
 class StatusSection:
@@ -29,13 +30,13 @@ class StatusSection:
             ui.headlineLabel.text = said[1]
             ui.detailLabel.text = said[2]
         confidence = status.confidence
-        self._set(ui.confidenceLabel, "–" if confidence is None else f"{round(100 * confidence)} %")
+        set_text(ui.confidenceLabel, "–" if confidence is None else f"{round(100 * confidence)} %")
         ui.confidenceBar.value = 0 if confidence is None else round(100 * confidence)
         latency_ms = status.latency_ms
-        self._set(ui.latencyLabel, "–" if latency_ms is None else f"{latency_ms:.0f} ms")
-        self._set(ui.ageLabel, live_texts.age(status.verdict.age_s))
-        self._set(ui.droppedLabel, str(status.dropped))
-        self._set(ui.modelLabel, self._origin(status))
+        set_text(ui.latencyLabel, "–" if latency_ms is None else f"{latency_ms:.0f} ms")
+        set_text(ui.ageLabel, live_texts.age(status.verdict.age_s))
+        set_text(ui.droppedLabel, str(status.dropped))
+        set_text(ui.modelLabel, self._origin(status))
 
     @staticmethod
     def _origin(status: Status) -> str:
@@ -43,8 +44,3 @@ class StatusSection:
         if status.device:
             return _("The model runs on: {device}").format(device=status.device)
         return _("The poses were made before; no model runs.") if status.result is not None else ""
-
-    @staticmethod
-    def _set(label, text: str) -> None:
-        if label.text != text:
-            label.text = text

@@ -13,6 +13,7 @@ from pathlib import Path
 import qt
 
 from ..case.steps import Step, StepState
+from .labels import set_text
 
 # Readable on light and on dark themes.
 COLOURS = {
@@ -44,8 +45,7 @@ def allow(button, reason: str, otherwise: str) -> None:
 def show_status(label, step: Step) -> None:
     text = html.escape(step.text).replace("\n", "<br>")
     text = f'<span style="color:{COLOURS[step.state]}"><b>{SYMBOLS[step.state]}</b></span> {text}'
-    if label.text != text:
-        label.text = text
+    set_text(label, text)
 
 
 def single_shot(milliseconds: int, action: Callable[[], None]):

@@ -13,6 +13,7 @@ from slicer.i18n import tr as _
 from ..errors import ExpectedAppearancesError
 from ..runs.runner import Run
 from ..runs.state import RunState, RunStatus, controls
+from .labels import set_text
 from .planning_qt import allow
 
 POLL_MS = 500
@@ -88,9 +89,7 @@ class RunControls:
         state = controls(status.state, problem, unfinished)
         allow(self._start, state.start, self._start_hint)
         allow(self._cancel, state.cancel, _("End the run. What is finished is kept."))
-        text = _(START_TEXTS[state.action])
-        if self._start.text != text:
-            self._start.text = text
+        set_text(self._start, _(START_TEXTS[state.action]))
         self._bar.visible = self.watch.active
         self._bar.value = round(100 * status.fraction)
         self._label.text = _line(status) or (problem if problem != said else "")
