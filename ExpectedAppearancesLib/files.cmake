@@ -23,6 +23,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/augmentation/impostors.py
   ExpectedAppearancesLib/augmentation/microscope.py
   ExpectedAppearancesLib/augmentation/surroundings.py
+  ExpectedAppearancesLib/cancelling.py
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py
@@ -58,6 +59,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/study.py
   ExpectedAppearancesLib/evaluation/study_figures.py
   ExpectedAppearancesLib/evaluation/study_folds.py
+  ExpectedAppearancesLib/evaluation/study_frames.py
   ExpectedAppearancesLib/evaluation/study_report.py
   ExpectedAppearancesLib/evaluation/verdict.py
   ExpectedAppearancesLib/executor.py

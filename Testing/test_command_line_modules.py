@@ -254,7 +254,7 @@ def test_bad_input_is_listed_and_ends_with_2(rendered, tmp_path):
 def test_only_one_run_of_a_kind_works_on_a_case(rendered):
     with exclusive(rendered.folder, "train"):
         done = shell("train", rendered.folder)
-    assert done.returncode == 2 and "another train is going on in this case" in done.stderr
+    assert done.returncode == 2 and "a training is going on in it" in done.stderr
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")

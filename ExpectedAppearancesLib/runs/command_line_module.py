@@ -163,7 +163,6 @@ def main(command: str, arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(command: str, arguments: list[str], progress: SlicerProgress) -> int:
-    from .record import exclusive
     from .results import result_problem
 
     case_folder = Path(arguments[0]).absolute() if arguments and not arguments[0].startswith("-") else None
@@ -171,13 +170,8 @@ def _run(command: str, arguments: list[str], progress: SlicerProgress) -> int:
         return cli.main([command, *arguments])  # explains itself, or says what is wrong with the case
     progress._case_folder = case_folder
     progress.start()
-    try:
-        with exclusive(case_folder, command):
-            code = cli.main([command, *arguments], progress)
-            problem = result_problem(command, case_folder, thorough=True) if code == EXIT_DONE else ""
-    except InputError as error:
-        cli.say_problems(command, error.problems)
-        return EXIT_BAD_INPUT
+    code = cli.main([command, *arguments], progress)
+    problem = result_problem(command, case_folder, thorough=True) if code == EXIT_DONE else ""
     if problem:
         print(f"Failed: {problem}", file=sys.stderr, flush=True)
         return EXIT_FAILED
