@@ -16,6 +16,7 @@ from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_s
 from .case import MANIFEST_NAME, Case
 from .steps import Recorded
 
+STOPPED = ("cancelled", "failed")  # outcomes of a run as its record names them
 LARGEST_HEADER_BYTES = 1 << 24
 
 
@@ -54,6 +55,7 @@ class CaseReader:
             state.get("step", 0),
             "stale" if stale else "known" if rows else "",
             verdict(rows, limits) if rows else None,
+            (self._once(case.folder / "runs" / "study.json", _read_object) or {}).get("outcome") in STOPPED,
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:

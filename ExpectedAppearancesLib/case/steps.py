@@ -70,7 +70,8 @@ class Recorded:
     """What the case folder holds: case.json, the camera, the index of the appearances, model.json; None where absent.
 
     overview_changed: the view that method `surface` synthesises on is another one now. appearances_sha256: of the
-    index. steps_trained: of a training that was stopped, 0 where there is none. validation: whether figures are there,
+    index. steps_trained: of a training that was stopped, 0 where there is none. study_stopped: the last study was ended
+    before it was done. validation: whether figures are there,
     verdict of `evaluation.verdict` on them: (ready, reasons).
     """
 
@@ -84,6 +85,7 @@ class Recorded:
     steps_trained: int = 0
     validation: str = ""
     verdict: tuple[bool, tuple[str, ...]] | None = None
+    study_stopped: bool = False
 
 
 def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
@@ -95,7 +97,7 @@ def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
         "textures": _textures(chosen),
         "appearances": _appearances(chosen, recorded),
         "training": _training(chosen, recorded),
-        "validation": _validation(recorded),
+        "validation": _validation(chosen, recorded),
     }
     names = {"case": "the case", "microscope": "the microscope", "poses": "the poses"}
     names |= {"appearances": "the expected appearances", "training": "the model"}
@@ -265,7 +267,9 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     return Step(StepState.DONE, f"Trained with preset {trained}.")
 
 
-def _validation(recorded: Recorded) -> Step:
+def _validation(chosen: Chosen, recorded: Recorded) -> Step:
+    if "study" in chosen.running:
+        return Step(StepState.RUNNING, "A study is going on: for each texture a model is trained without it.")
     if recorded.verdict is None:
         return Step(StepState.MISSING, "Train the model first." if recorded.model is None else "No figures yet.")
     ready, reasons = recorded.verdict

@@ -11,7 +11,7 @@ from slicer.i18n import tr as _
 from ..case.steps import StepState
 from ..gpus import device_arguments
 from ..textures.library import LABELS_SUFFIX
-from .planning_run import RunControls, started
+from .planning_run import RunControls, in_the_way, started
 from .planning_section import Section
 
 NEWEST_PX = 220
@@ -48,9 +48,7 @@ class AppearancesSection(Section):
             before = self.panel.steps[name]
             if before.state in (StepState.STALE, StepState.MISSING):
                 problem = problem or before.text
-        problem = problem or self.panel.help.reason("training")
-        if self.panel.runs["train"].active:
-            problem = _("The model is being trained; cancel that first.")
+        problem = in_the_way(self.panel, "synthesize") or problem or self.panel.help.reason("training")
         index = self.panel.recorded.index
         self.controls.refresh(problem, unfinished=bool(index and not index["done"]), said=step.text)
         self._show_newest(p)

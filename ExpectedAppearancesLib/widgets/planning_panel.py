@@ -36,7 +36,7 @@ SECTIONS = (
     TrainingSection,
     ValidationSection,
 )
-SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training"}
+SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training", "study": "validation"}
 
 
 class PlanningPanel:
@@ -189,6 +189,8 @@ class PlanningPanel:
         if status.state is RunState.DONE and self.entered:
             self.refresh()
             self._go_on_from(SECTION_OF_KIND[kind])
+            if kind == "study":
+                self.sections["validation"].on_show()
         self.refresh_soon()
 
     def _show_next(self) -> None:
