@@ -108,6 +108,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/live_scene.py
   ExpectedAppearancesLib/mrml/live_stream.py
   ExpectedAppearancesLib/mrml/live_views.py
+  ExpectedAppearancesLib/mrml/mri.py
   ExpectedAppearancesLib/mrml/planning.py
   ExpectedAppearancesLib/mrml/planning_adopt.py
   ExpectedAppearancesLib/mrml/planning_session.py

@@ -170,6 +170,13 @@ class Case:
         entry.update({"updated": _now(), "versions": _versions()} | values)
         files.write_json(path, self.manifest)
 
+    def attach(self, name: str, entry: dict) -> None:
+        """Note a file that lies in the case and that no stage depends on, in manifest["attachments"][name]."""
+        path = self.folder / MANIFEST_NAME
+        self.manifest = _read_manifest(path)
+        self.manifest.setdefault("attachments", {})[name] = entry
+        files.write_json(path, self.manifest)
+
 
 def _check_new_folder(folder: Path, problems: Problems) -> None:
     if folder.is_file():

@@ -48,7 +48,8 @@ class Chosen:
     changed: names of the inputs ("vessel model", ...) that differ from those of the case. camera: None where it is not
     given or wrong, then camera_problem says why. poses: {"poses", "seed", "ranges", "craniotomy"} as `render` records
     them, None where they cannot be had. textures: name -> SHA-256 of image and labels, "" while it has not been read.
-    synthesis: {"size_px", "iterations"}. running: kinds of runs that go on.
+    synthesis: {"size_px", "iterations"}. running: kinds of runs that go on. scan_unsaved: the chosen MRI is not in the
+    case, which changes nothing that is made from it.
     """
 
     folder: str = ""
@@ -63,6 +64,7 @@ class Chosen:
     synthesis: dict = field(default_factory=dict)
     preset: str = ""
     running: frozenset[str] = frozenset()
+    scan_unsaved: bool = False
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,8 @@ def _case(chosen: Chosen, recorded: Recorded) -> Step:
         changed.append("microscope")
     if changed:
         return Step(StepState.STALE, f"Changed since the case was saved: {_listed(changed)}. Save the case again.")
+    if chosen.scan_unsaved:
+        return Step(StepState.DONE, "Saved, but without the MRI that is chosen now: save again to add it.")
     return Step(StepState.DONE, "Saved.")
 
 

@@ -17,7 +17,7 @@ from ..geometry.camera import Camera, read_camera, write_camera
 from ..poses.craniotomy import Craniotomy, find_craniotomy
 from ..poses.sampling import PoseRanges, PoseSampler
 from ..textures.library import list_textures, shipped_textures_folder
-from . import planning
+from . import mri, planning
 
 MODELS = {"vessels": "vessel model", "cortex": "cortex model"}
 
@@ -204,6 +204,7 @@ class PlanningSession:
             {"size_px": parameters.sizePx, "iterations": parameters.iterations},
             parameters.preset.value,
             running,
+            self.scan_to_keep(parameters) is not None,
         )
 
     def recorded(self, parameters) -> Recorded:
@@ -216,6 +217,21 @@ class PlanningSession:
         return Limits(
             parameters.addLimitMm, parameters.acceptedLimitPercent / 100, parameters.accuracyLimitPercent / 100
         )
+
+    def scan_to_keep(self, parameters) -> dict | None:
+        """Identity of the chosen MRI where the saved case does not hold it yet; None where nothing is to be done."""
+        case, node = self.case(parameters), parameters.mriVolume
+        if case is None or node is None or not (node.GetImageData() and node.GetImageData().GetNumberOfPoints()):
+            return None
+        parent = node.GetParentTransformNode()
+        placed = tuple(mri.placement(node))
+        moved = parent.GetTransformToWorldMTime() if parent else 0
+        version = (node.GetID(), node.GetImageData().GetMTime(), placed, moved)
+        identity = self._once("mri", version, lambda: mri.scan_identity(node))
+        known = self._once(
+            "mri.known", (version, case.folder, _Same(case.manifest)), lambda: mri.is_scan_of(case, identity)
+        )
+        return None if known else identity
 
     def problems_of_new_case(self, parameters, folder: str) -> list[str]:
         """Everything that keeps the chosen inputs from being saved as a case in `folder`, at once."""

@@ -150,9 +150,21 @@ class LivePanel:
         finally:
             qt.QApplication.restoreOverrideCursor()
         self._parameter_node.browser = None
+        self._show_scan()
         self.refresh()
         self.tick()
         return True
+
+    def _show_scan(self) -> None:
+        """The MRI that the case was planned on, unless another one is chosen."""
+        p = self._parameter_node
+        try:
+            scan = self.controller.scan(p.mriVolume)
+        except ExpectedAppearancesError as error:  # registration does without
+            self.say(str(error))
+            return
+        if scan is not p.mriVolume:
+            p.mriVolume = scan
 
     def stop(self) -> None:
         self.controller.stop()

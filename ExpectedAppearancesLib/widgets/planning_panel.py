@@ -138,6 +138,8 @@ class PlanningPanel:
                         slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
                     elif slicer.app.layoutManager():
                         slicer.util.resetThreeDViews()
+                        if self.parameters.mriVolume:
+                            slicer.util.setSliceViewerLayers(background=self.parameters.mriVolume, fit=True)
             finally:
                 self.loading = False
         self.refresh()
