@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from ..appearances.store import METHODS
+from ..appearances.store import METHODS, newest_image
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
 from .case import MANIFEST_NAME, Case
@@ -82,6 +82,10 @@ class CaseReader:
         if state.get("curve"):
             return state["curve"]
         return (self._once(case.model_folder / "training.json", _read_object) or {}).get("curve", [])
+
+    def newest_image(self, case: Case, method: str) -> tuple[Path | None, int]:
+        """The appearance that was finished last, and how many there are."""
+        return self._once(case.appearances_folder / method, newest_image) or (None, 0)
 
     def _open(self, path: Path) -> tuple[Case | None, str]:
         try:
