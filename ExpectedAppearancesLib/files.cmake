@@ -145,6 +145,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
   ExpectedAppearancesLib/textures/proposal.py
+  ExpectedAppearancesLib/textures/thumbnails.py
   ExpectedAppearancesLib/widgets/__init__.py
   ExpectedAppearancesLib/widgets/labels.py
   ExpectedAppearancesLib/widgets/live_align.py

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from dataclasses import replace
 
 import cases
 import numpy as np
 import pytest
 
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.appearances import store
+from ExpectedAppearancesLib.appearances.overview import overview_view
+from ExpectedAppearancesLib.case import recorded
 from ExpectedAppearancesLib.case.steps import StepState
 from ExpectedAppearancesLib.geometry.camera import read_camera
 
-pytest.importorskip("slicer")
-import vtk
-from planning_scene import LPS, Source, Where, parameters, save, turned
+slicer = pytest.importorskip("slicer")
+import vtk  # noqa: E402 (after the skip)
+from planning_scene import LPS, Source, Where, parameters, save, turned  # noqa: E402
+from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
 
-from ExpectedAppearancesLib.mrml.planning_adopt import adopt
+from ExpectedAppearancesLib.mrml import mri, planning, planning_session  # noqa: E402
+from ExpectedAppearancesLib.mrml.planning_adopt import adopt  # noqa: E402
 
 
 def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
@@ -119,6 +126,121 @@ def test_microscope_from_its_field_of_view(planned):
     camera = session.camera(p)
     assert camera.width / camera.fx * 300.0 == pytest.approx(40.0)
     assert read_camera(p.calibrationPath) == session.camera(parameters(calibrationPath=p.calibrationPath))
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How often each thing that costs was done since the last look."""
+    done = Counter()
+
+    def count(module, name):
+        usual = getattr(module, name)
+
+        def noted(*arguments, **named):
+            done[name] += 1
+            return usual(*arguments, **named)
+
+        noted.__name__ = name
+        monkeypatch.setattr(module, name, noted)
+
+    for module, name in (
+        (files, "sha256"),
+        (files, "read_json"),
+        (recorded, "overview_changed"),
+        (recorded, "training_state"),
+        (recorded, "newest_image"),
+        (planning, "world_mesh"),
+        (planning, "same_mesh"),
+        (planning_session, "find_craniotomy"),
+        (planning_session, "PoseSampler"),
+        (mri, "scan_identity"),
+    ):
+        count(module, name)
+
+    def look() -> dict:
+        found = dict(done)
+        done.clear()
+        return found
+
+    return look
+
+
+def test_a_refresh_does_only_what_has_changed(scene, planned, tmp_path, counted):
+    """Ticks of the panel's timer must stay cheap however large the case is, so work is counted, not timed."""
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    case = save(session, p, tmp_path)
+    case.record("render", **session.pose_settings(p), circular_field=None, done=True)
+    camera, pose = overview_view(session.craniotomy(p), case.cortex, 64)
+    item = {"style": "a", "image": "a.png", "texture_sha256": "", "camera_from_world": pose.tolist()}
+    settings = {"size_px": 384, "iterations": 50, "overview": pose.tolist()}
+    store.write_index(case, "surface", camera, settings, [item] * 500, done=True)
+    (case.model_folder).mkdir()
+    (case.model_folder / "checkpoint.safetensors").write_bytes(b"")
+
+    def tick():
+        record = session.recorded(p)
+        session.steps(p, frozenset({"train"}), record)
+        session.reader.curve(session.case(p))
+        session.reader.newest_image(session.case(p), "surface")
+        return counted()
+
+    assert tick()["overview_changed"] == 1
+    assert [tick() for _ in range(5)] == [{}] * 5
+    case.record("train", done=False)
+    counted()  # what writing reads
+    assert tick() == {"read_json": 2}  # the manifest and the camera; nothing is hashed again
+    (case.model_folder / "checkpoint.safetensors").write_bytes(b"12345678")
+    assert tick() == {"training_state": 1}
+    (case.appearances_folder / "surface" / "b.png").touch()
+    assert tick() == {"newest_image": 1}
+    p.tiltMaxDeg = 40.0
+    assert tick() == {"PoseSampler": 1}
+    p.vesselsNode.SetAndObserveTransformNodeID(None)
+    moved = tick()
+    assert moved == {"world_mesh": 1, "same_mesh": 1, "find_craniotomy": 1, "PoseSampler": 1}
+    store.write_index(case, "surface", camera, settings, [item] * 501, done=True)
+    assert tick() == {"read_json": 1, "sha256": 1, "overview_changed": 1, "newest_image": 1}
+
+
+def test_prepared_in_pieces_it_answers_at_once(scene, planned, tmp_path, counted):
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    save(session, p, tmp_path)
+    p.vesselsNode.GetPolyData().Modified()
+    counted()
+    done = []
+    for _piece in session.prepare(p):
+        done.append(counted())
+    assert max(len(piece) for piece in done) <= 2 and sum(piece.get("world_mesh", 0) for piece in done) == 1
+    session.steps(p)
+    assert counted() == {}
+    p.vesselsNode.SetAndObservePolyData(vtk.vtkPolyData())
+    list(session.prepare(p))  # what is wrong is said by the steps
+    assert session.steps(p)["poses"].state is StepState.MISSING
+
+
+def test_a_segment_that_is_drawn_on_waits_for_the_end_of_a_run(scene, planned, counted):
+    session, p = planned
+    image = slicer.vtkOrientedImageData()
+    image.SetDimensions(12, 12, 12)
+    image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
+    voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(12, 12, 12)
+    voxels[:] = 0
+    voxels[3:8, 3:8, 3:8] = 1
+    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "S")
+    node.CreateDefaultDisplayNodes()
+    p.vesselsSegmentId = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
+    p.vesselsNode = node
+    session.busy = True
+    before = session.mesh(p, "vessels")
+    assert counted() == {"world_mesh": 1}  # newly chosen: it is looked at all the same
+    segment = node.GetSegmentation().GetSegment(p.vesselsSegmentId)
+    segment.GetRepresentation(node.GetSegmentation().GetSourceRepresentationName()).Modified()
+    assert session.mesh(p, "vessels") is before and counted() == {}
+    session.busy = False
+    session.mesh(p, "vessels")
+    assert counted() == {"world_mesh": 1}
 
 
 def test_the_session_loads_nothing_heavy():

@@ -26,6 +26,7 @@ class CaseReader:
     def __init__(self) -> None:
         self._kept: dict[tuple, tuple] = {}
         self._case: Case | None = None
+        self._overview: tuple = (None, False)  # what `overview_changed` depends on, its answer
 
     def case(self, folder: str) -> tuple[Case | None, str]:
         """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
@@ -49,7 +50,7 @@ class CaseReader:
             case.manifest,
             case.camera,
             index,
-            overview_changed(case, index) if method == "surface" and index else False,
+            self._overview_changed(case, index, index_sha256) if method == "surface" and index else False,
             model,
             index_sha256,
             state.get("step", 0),
@@ -89,7 +90,7 @@ class CaseReader:
 
     def _open(self, path: Path) -> tuple[Case | None, str]:
         try:
-            case = Case.open(path.parent)
+            case = Case.open(path.parent, lambda file: self._once(file, files.sha256))
         except InputError as error:
             return None, str(error)
         known = self._case
@@ -98,6 +99,13 @@ class CaseReader:
             case.__dict__.update({n: known.__dict__[n] for n in ("vessels", "cortex") if n in known.__dict__})
         self._case = case
         return case, ""
+
+    def _overview_changed(self, case: Case, index: dict, index_sha256: str) -> bool:
+        craniotomy = case.manifest["stages"].get("render", {}).get("craniotomy")
+        version = (case.folder, str(case.manifest["inputs"]), str(craniotomy), index_sha256)
+        if self._overview[0] != version:
+            self._overview = (version, overview_changed(case, index))
+        return self._overview[1]
 
     def _once(self, path: Path, read: Callable[[Path], object]):
         """read(path), again only where the file changed; None where there is no such file."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +34,7 @@ class PlanningSession:
         self.reader = CaseReader()
         self.texture_digests: dict[tuple, str] = {}  # (name, version of its files) -> SHA-256, or "" without OpenCV
         self.texture_problems: dict[tuple, str] = {}
+        self.busy = False  # a run goes on: segments that are drawn on are looked at when it has ended
         self._kept: dict[str, tuple] = {}
 
     def case(self, parameters) -> Case | None:
@@ -49,7 +52,13 @@ class PlanningSession:
             return getattr(case, name) if case and (name == "vessels" or parameters.vesselsNode is None) else None
         segment_id = parameters.vesselsSegmentId if name == "vessels" else ""
         space = self.space(parameters)
-        version = (node.GetID(), segment_id, space, _version_of(node, segment_id))
+        chosen = (node.GetID(), segment_id, space)
+        kept = self._kept.get(f"mesh.{name}")
+        if self.busy and node.IsA("vtkMRMLSegmentationNode") and kept and kept[0][:3] == chosen:
+            # To make a surface of a segment takes seconds, and a run that goes on does not use it.
+            version = kept[0]
+        else:
+            version = (*chosen, _version_of(node, segment_id))
         return self._once(f"mesh.{name}", version, lambda: planning.world_mesh(node, segment_id, space))
 
     def camera(self, parameters) -> Camera:
@@ -80,10 +89,19 @@ class PlanningSession:
                 raise InputError("Choose a point or a closed curve on the cortex, or let the craniotomy be fitted.")
             # Moving a point does not change the node's time of modification, so its points tell.
             placed = (node.GetNumberOfDefinedControlPoints(), planning.markup_points_ras(node).tobytes())
+            axis = self._fitted_axis(vessels, cortex, space)
             version = (_Same(vessels), _Same(cortex), node.GetID(), placed)
-            return self._once("marked", version, lambda: planning.craniotomy_of_markups(node, vessels, cortex, space))
-        version = (_Same(vessels), _Same(cortex))
-        return self._once("fitted", version, lambda: find_craniotomy(vessels, cortex, space))
+            return self._once(
+                "marked", version, lambda: planning.craniotomy_of_markups(node, vessels, cortex, space, axis)
+            )
+        axis = self._fitted_axis(vessels, cortex, space)
+        version = (_Same(vessels), _Same(cortex), space)
+        return self._once("fitted", version, lambda: find_craniotomy(vessels, cortex, space, None, axis))
+
+    def _fitted_axis(self, vessels: Mesh, cortex: Mesh | None, space: str) -> np.ndarray:
+        """Takes a tenth of a second on a large model, and stays while a point is dragged or the vessels are moved."""
+        version = (_Same(cortex or vessels), space)
+        return self._once("axis", version, lambda: find_craniotomy(vessels, cortex, space).outward_axis)
 
     def ranges(self, parameters) -> PoseRanges:
         distance = (parameters.nearestMm, parameters.farthestMm)
@@ -210,8 +228,30 @@ class PlanningSession:
     def recorded(self, parameters) -> Recorded:
         return self.reader.recorded(parameters.casePath, parameters.method.value, self.limits(parameters))
 
-    def steps(self, parameters, running: frozenset[str] = frozenset()) -> dict[str, Step]:
-        return plan_steps(self.chosen(parameters, running), self.recorded(parameters))
+    def steps(
+        self, parameters, running: frozenset[str] = frozenset(), recorded: Recorded | None = None
+    ) -> dict[str, Step]:
+        return plan_steps(self.chosen(parameters, running), recorded or self.recorded(parameters))
+
+    def prepare(self, parameters) -> Iterator[None]:
+        """Work out what `steps` needs, a piece at each step; then `steps` answers at once. Changes nothing else."""
+        case = self.case(parameters)
+        yield
+        for piece in (
+            lambda: self.mesh(parameters, "vessels"),
+            lambda: self.mesh(parameters, "cortex"),
+            lambda: self._fitted_axis(*self._meshes(parameters), self.space(parameters)),
+            lambda: self.craniotomy(parameters),
+            lambda: self.sampler(parameters),
+            lambda: case and case.vessels,
+            lambda: case and case.cortex,
+            lambda: self.changed_models(parameters),
+            lambda: self.scan_to_keep(parameters),
+            lambda: self.recorded(parameters),
+        ):
+            with contextlib.suppress(InputError):  # said by the step that it belongs to
+                piece()
+            yield
 
     def limits(self, parameters) -> Limits:
         return Limits(

@@ -83,8 +83,8 @@ class TrainingSection(Section):
 
     def on_start(self) -> None:
         self._live = []
-        if started(self.panel, self.controls.watch, *self.arguments()):
-            self.on_show_loss()
+        self.on_show_loss()  # before: to open a plot view takes Slicer a while
+        started(self.panel, self.controls.watch, *self.arguments())
 
     def arguments(self) -> tuple[list[str], dict[str, str]]:
         """Options of the command `train`, and what its environment needs."""
