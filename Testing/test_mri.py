@@ -15,7 +15,6 @@ from planning_scene import add_transform, parameters, save, turned  # noqa: E402
 from vtk.util.numpy_support import numpy_to_vtk, vtk_to_numpy  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import mri  # noqa: E402
-from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
 from ExpectedAppearancesLib.mrml.planning_adopt import adopt  # noqa: E402
 
 SIZE = (20, 24, 28)
@@ -168,17 +167,13 @@ def test_what_is_missing_or_damaged_is_told(scene, planned, case):
     assert adopt(session, p, scene) is not None and p.mriVolume is None  # the case can be worked on all the same
 
 
-def test_the_live_panel_shows_the_scan_of_its_case(scene, case, tmp_path):
-    controller = LiveController(scene)
-    controller.open_case(case.folder)
-    assert controller.scan(None) is None
+def test_the_live_panel_shows_the_scan_of_its_case(scene, case):
+    assert mri.scan_to_show(scene, case, None) is None
     chosen = volume(scene, "chosen by the user", 5)
+    assert mri.scan_to_show(scene, case, chosen) is chosen
     mri.keep_scan(case, volume(slicer.vtkMRMLScene()))
-    controller.close()
-    controller.open_case(case.folder)
-    found = controller.scan(None)
+    found = mri.scan_to_show(scene, case, None)
     assert found.GetName() == "T1"
-    assert controller.scan(found) is found and controller.scan(chosen) is chosen
+    assert mri.scan_to_show(scene, case, found) is found and mri.scan_to_show(scene, case, chosen) is chosen
     chosen.SetAttribute(mri.ATTRIBUTE, "that of another case")
-    assert controller.scan(chosen) is found
-    controller.close()
+    assert mri.scan_to_show(scene, case, chosen) is found

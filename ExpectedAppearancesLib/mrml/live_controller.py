@@ -27,7 +27,6 @@ from . import live_record
 from .live_align import Alignment, pose_of_landmarks
 from .live_scene import FRAME, LiveScene, OverlayOptions, node_of_role, remove_live_nodes
 from .live_stream import NodeFrames
-from .mri import scan_to_show
 
 
 class Views(Protocol):
@@ -110,10 +109,6 @@ class LiveController:
             self.live = LiveScene(self._scene, case)
             self.live.set_options(self.options)
         return self.case
-
-    def scan(self, chosen):
-        """The volume to show as the MRI: the chosen one, else the case's, None without either. Raises InputError."""
-        return scan_to_show(self._scene, self.case, chosen)
 
     def restore(self, case_path: Path, camera: Camera) -> bool:
         """Show the frame that a saved scene brought, as `camera` took it, without overlay. False where there is none.
