@@ -230,6 +230,12 @@ import ExpectedAppearances as module
 logic = module.ExpectedAppearancesLogic()
 from ExpectedAppearancesLib.widgets.planning_panel import PlanningPanel
 panel = PlanningPanel(MagicMock(), logic.session, MagicMock())
+parameters = module.ExpectedAppearancesParameterNode()
+for name in ("vesselsNode", "cortexModel", "mriVolume", "craniotomyNode"):
+    setattr(parameters, name, None)
+panel.set_parameters(parameters, lambda: None)
+panel.enter()
+assert all(panel.steps[name].text for name in panel.sections), panel.steps
 heavy = ("torch", "cv2", "onnxruntime", "skimage", "scipy", "matplotlib")
 print([name for name in heavy if name in sys.modules], len(panel.sections))
 """
