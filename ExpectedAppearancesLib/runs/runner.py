@@ -18,7 +18,8 @@ from .record import RunRecord, exclusive, read_record, update_record, write_reco
 from .results import remove_partial_files, result_problem
 from .state import RunState, RunStatus
 
-CANCEL_DEADLINE_S = 10.0  # after which the processes are no longer asked to end
+# After which the processes are no longer asked to end. A training ends its step, or validation, and saves.
+CANCEL_DEADLINE_S = 30.0
 SWEEP_DEADLINE_S = 5.0
 START_LOCK_S = 1.0
 TAIL_LINES = 8
