@@ -53,16 +53,16 @@ class VesselAligner:
         principal = np.array([self._camera.cx, self._camera.cy])
         edges = self._silhouette.edges(fit.camera_from_world, facing_borders_only=True)
         edges = edges[:: len(edges) // POINTS + 1]
-        relative = self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm
+        relative = np.ascontiguousarray((self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm).T)
         rotation = first = fit.camera_from_world[:3, :3]
         position = start = rotation @ fit.centre_world_mm + fit.camera_from_world[:3, 3]
         prior = np.linalg.inv(fit.covariance * PRIOR)
         information = prior
         for _ in range(ITERATIONS):
-            turned = relative @ rotation.T
-            seen = turned + position
-            pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1.0) * focal + principal
-            where = ((pixels + 0.5) * (UPSAMPLING / 2) - 0.5).astype(np.float32)[None]
+            turned = rotation @ relative
+            seen = turned + position[:, None]
+            pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
+            where = np.ascontiguousarray(((pixels + 0.5) * (UPSAMPLING / 2) - 0.5).T, np.float32)[None]
             distance, along, down = cv2.split(
                 cv2.remap(field, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e3, 0, 0))
             )
@@ -70,11 +70,11 @@ class VesselAligner:
             distance = distance[0]
             weight = (1 - np.minimum(np.abs(distance) / (REACH_PX * scale), 1) ** 2) ** 2 * inside
             jacobian = projection_jacobian(turned, seen, focal)
-            gradient = along[0][:, None] * jacobian[:, 0] + down[0][:, None] * jacobian[:, 1]
-            weighted = gradient * (weight * INDEPENDENT / ((SIGMA_PX * scale) ** 2 * max(1, len(edges))))[:, None]
-            information = weighted.T @ gradient + prior
+            gradient = along[0] * jacobian[:, 0] + down[0] * jacobian[:, 1]
+            weighted = gradient * (weight * INDEPENDENT / ((SIGMA_PX * scale) ** 2 * max(1, len(edges))))
+            information = weighted @ gradient.T + prior
             gone = np.concatenate([rotation_vector(rotation @ first.T), position - start])
-            step = np.linalg.solve(information, -weighted.T @ distance - prior @ gone)
+            step = np.linalg.solve(information, -weighted @ distance - prior @ gone)
             rotation = rotation_matrix(step[:3]) @ rotation
             position = position + step[3:]
             if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-2:
