@@ -11,10 +11,11 @@ from ..geometry.camera import Camera
 from ..geometry.pose import pose_from_rotation, rotation_matrix
 
 RANSAC_POINTS = 400
+COARSE_POINTS, MOST_POINTS = 400, 4096
 RANSAC_THRESHOLD_PX = 2.5  # of a network input of 128 px; scaled with its size
 HUBER = 1.5  # residuals beyond this many standard deviations lose weight
 ITERATIONS = 12
-STILL_RAD, STILL_MM = 1e-5, 1e-3  # a step below which nothing more is gained
+STILL_RAD, STILL_MM = 1e-4, 1e-2  # a step below which nothing more is gained
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,25 @@ def fit_pose(
         return None
     if not found or not np.isfinite(translation).all():
         return None
-    return _refine(
-        rotation_matrix(rotation_vector), translation.ravel(), points_world_mm, pixels, sigma_mm, camera, threshold_px
-    )
+    rotation, translation = rotation_matrix(rotation_vector), translation.ravel()
+    # A few points bring it near, all of them then need a step or two.
+    every = len(points_world_mm) // COARSE_POINTS
+    if every > 1:
+        some = slice(None, None, every)
+        near = _refine(rotation, translation, points_world_mm[some], pixels[some], sigma_mm[some], camera, threshold_px)
+        if near is not None:
+            rotation, translation = near.camera_from_world[:3, :3], near.camera_from_world[:3, 3]
+    return _refine(rotation, translation, points_world_mm, pixels, sigma_mm, camera, threshold_px)
 
 
 def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_px) -> PoseFit | None:
     centre = points.mean(axis=0)
+    # More points than this tell the same again; those left out count through their neighbours.
+    every = -(-len(points) // MOST_POINTS)
     # One row of numbers per coordinate: a third of the time of one row per point.
-    relative = np.ascontiguousarray((points - centre).T)
-    target = np.ascontiguousarray(pixels.T)
+    relative = np.ascontiguousarray((points[::every] - centre).T)
+    target = np.ascontiguousarray(pixels[::every].T)
+    sigma_mm = sigma_mm[::every]
     position = rotation @ centre + translation  # the points' centre in the camera frame
     focal = np.array([camera.fx, camera.fy])
     principal = np.array([camera.cx, camera.cy])
@@ -85,10 +95,10 @@ def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_p
         depth = np.maximum(seen[2], 1.0)
         residual = target - (seen[:2] / depth * focal[:, None] + principal[:, None])
         sigma_px = np.maximum(focal.mean() * sigma_mm / depth, 0.2)
-        distance = np.hypot(*residual)
+        distance = np.sqrt(residual[0] ** 2 + residual[1] ** 2)
         scaled = distance / sigma_px
         # Huber weights, and none for what lies far off: an instrument, another patient's vessel.
-        weight = np.where(scaled < HUBER, 1.0, HUBER / np.maximum(scaled, 1e-9)) / sigma_px**2
+        weight = every * np.minimum(1.0, HUBER / np.maximum(scaled, 1e-9)) / sigma_px**2
         weight *= distance < 4 * threshold_px
         jacobian = projection_jacobian(turned, seen, focal)
         weighted = (jacobian * weight).reshape(6, -1)
@@ -103,7 +113,7 @@ def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_p
     inlier_share = float((distance < threshold_px).mean())
     pose = pose_from_rotation(rotation, position - rotation @ centre)
     mean_residual = float(np.minimum(scaled, 10).mean())
-    return PoseFit(pose, centre, np.linalg.inv(information), inlier_share, mean_residual, int((weight > 0).sum()))
+    return PoseFit(pose, centre, np.linalg.inv(information), inlier_share, mean_residual, every * int((weight > 0).sum()))
 
 
 def projection_jacobian(turned: np.ndarray, seen: np.ndarray, focal: np.ndarray) -> np.ndarray:
