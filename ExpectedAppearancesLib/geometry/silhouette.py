@@ -32,13 +32,17 @@ class Silhouette:
 
         facing_borders_only: leave out border edges of triangles that turn their back, which mostly hide behind others.
         """
-        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
         if not len(self._edges):
             return self._edges
-        towards = self._face_normals @ (centre_mm - self._middle_mm) > self._face_offsets
+        towards = self.towards(camera_from_world)
         facing = np.add.reduceat(towards[self._triangles_at].astype(np.int32), self._first_at)
         border = (self._sides == 1) & (facing >= (1 if facing_borders_only else 0))
         return self._edges[border | ((facing > 0) & (facing < self._sides))]
+
+    def towards(self, camera_from_world: np.ndarray) -> np.ndarray:
+        """bool (F,): whether each triangle faces the camera."""
+        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+        return self._face_normals @ (centre_mm - self._middle_mm) > self._face_offsets
 
     def on_plane(self, camera_from_world: np.ndarray, plane_depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """The outline seen from the pose, drawn on the plane z = plane_depth_mm of the camera.
