@@ -113,7 +113,8 @@ def _refine(rotation, translation, points, pixels, sigma_mm, camera, threshold_p
     inlier_share = float((distance < threshold_px).mean())
     pose = pose_from_rotation(rotation, position - rotation @ centre)
     mean_residual = float(np.minimum(scaled, 10).mean())
-    return PoseFit(pose, centre, np.linalg.inv(information), inlier_share, mean_residual, every * int((weight > 0).sum()))
+    residuals = every * int((weight > 0).sum())
+    return PoseFit(pose, centre, np.linalg.inv(information), inlier_share, mean_residual, residuals)
 
 
 def projection_jacobian(turned: np.ndarray, seen: np.ndarray, focal: np.ndarray) -> np.ndarray:
@@ -123,7 +124,7 @@ def projection_jacobian(turned: np.ndarray, seen: np.ndarray, focal: np.ndarray)
     """
     x, y, z = turned
     along, down = focal[:, None] / np.maximum(seen[2], 1.0)
-    along_by_depth, down_by_depth = -np.stack([along, down]) ** 2 * seen[:2] / focal[:, None]
+    along_by_depth, down_by_depth = -(np.stack([along, down]) ** 2) * seen[:2] / focal[:, None]
     jacobian = np.zeros((6, 2, turned.shape[1]))
     jacobian[0, 0], jacobian[0, 1] = along_by_depth * y, down_by_depth * y - down * z
     jacobian[1, 0], jacobian[1, 1] = along * z - along_by_depth * x, -down_by_depth * x
