@@ -78,6 +78,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/live/recording.py
   ExpectedAppearancesLib/live/session.py
   ExpectedAppearancesLib/live/sources.py
+  ExpectedAppearancesLib/live/steady.py
   ExpectedAppearancesLib/live/trust.py
   ExpectedAppearancesLib/live/worker.py
   ExpectedAppearancesLib/masks/__init__.py

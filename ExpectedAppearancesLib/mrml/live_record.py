@@ -65,7 +65,14 @@ class Recorder:
             time_s,
             result.frame.name,
             result.camera,
-            Prediction(prediction.camera_from_world, result.accepted, prediction.confidence, prediction.latency_ms),
+            Prediction(
+                prediction.camera_from_world,
+                result.accepted,
+                prediction.confidence,
+                prediction.latency_ms,
+                prediction.covariance,
+            ),
+            steadied=result.steadied,
         )
         self._proxies[NOTE].SetText(to_note(frame, result.case_key))
         for role, sequence in self.sequences.items():
@@ -140,7 +147,7 @@ def export(browser, folder: Path, space: str) -> Path:
     folder = Path(folder)
     poses_path = export_recording(folder, (frame for frame, _key in recorded_frames(browser)))
     for number, (frame, _key) in enumerate(recorded_frames(browser, pixels=False)):
-        pose = frame.prediction.camera_from_world
+        pose = frame.camera_from_world
         if pose is not None:
             write_transform(folder / "transforms" / f"{number:05d}.tfm", camera_to_ras(pose, space))
     return poses_path

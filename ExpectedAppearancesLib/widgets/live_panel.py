@@ -113,6 +113,11 @@ class LivePanel:
         self._problem = self._missing or self.source.problem()
         self.ui.installButton.visible = bool(self._missing)
         self.controller.set_stale(p.staleMs / 1000)
+        try:
+            self.controller.set_steady(p.steady)
+        except ExpectedAppearancesError as error:
+            p.steady = False
+            self.say(str(error))
         options = OverlayOptions(p.outline, p.fill, p.fillOpacity, p.box)
         if options != self.controller.options:
             self.controller.set_options(options)
