@@ -13,6 +13,7 @@ from ..geometry.camera import Camera
 from ..live.trust import controls
 from ..mrml.live_controller import IDLE, LiveController
 from ..mrml.live_scene import OverlayOptions
+from ..mrml.mri import scan_to_show
 from . import live_install
 from .labels import set_text
 from .live_align import AlignSection
@@ -155,9 +156,21 @@ class LivePanel:
         finally:
             qt.QApplication.restoreOverrideCursor()
         self._parameter_node.browser = None
+        self._show_scan()
         self.refresh()
         self.tick()
         return True
+
+    def _show_scan(self) -> None:
+        """The MRI that the case was planned on, unless another one is chosen."""
+        p = self._parameter_node
+        try:
+            scan = scan_to_show(slicer.mrmlScene, self.controller.case, p.mriVolume)
+        except ExpectedAppearancesError as error:  # registration does without
+            self.say(str(error))
+            return
+        if scan is not p.mriVolume:
+            p.mriVolume = scan
 
     def stop(self) -> None:
         self.controller.stop()
