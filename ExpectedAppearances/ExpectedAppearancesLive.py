@@ -55,6 +55,7 @@ def registerSampleData():
     SampleData.SampleDataLogic.registerCustomSampleDataSource(
         category="Expected Appearances",
         sampleName="ExpectedAppearancesLivePhantom",
+        uris="",  # nothing is downloaded, but Slicer 5.8 counts them
         thumbnailFileName=str(icon),
         customDownloader=lambda _source=None: runSample(),
     )
