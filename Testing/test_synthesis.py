@@ -278,6 +278,7 @@ def test_torchvision_weights_give_the_same_features(tmp_path, vgg):
 def test_half_the_size_first_gives_images_as_near_to_the_texture_for_less(vgg, monkeypatch):
     """At 128 px and 10 iterations, 6 of them at half the size, against as many full-size ones for the same work."""
     monkeypatch.setattr("ExpectedAppearancesLib.appearances.workload.LEAST_COARSE_PX", 64)
+    monkeypatch.setattr("ExpectedAppearancesLib.appearances.workload.FINE_SHARE", 0.4)
     job = Job(label_map(128), texture("a", size=128), 1)
     fine, coarse = fine_and_coarse(job.labels.shape, 10)
     assert (fine, coarse) == (4, 6)

@@ -193,7 +193,8 @@ class _Trainer:
                 if time.monotonic() - saved > CHECKPOINT_EVERY_S:
                     self._save()
                     saved = time.monotonic()
-        self._validate(validation, recent)
+        if not state["curve"] or state["curve"][-1]["step"] != state["step"]:
+            self._validate(validation, recent)
         self._save()
 
     def export(self, calibration: Batch, validation: Batch, on_record: dict) -> dict:
