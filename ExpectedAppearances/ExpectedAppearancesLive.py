@@ -66,7 +66,7 @@ def runSample():
     from ExpectedAppearancesLib.widgets.live_sample import run_sample
 
     widget = slicer.util.getModuleWidget("ExpectedAppearancesLive")
-    if slicer.util.mainWindow(verbose=False):
+    if slicer.util.mainWindow():
         slicer.util.selectModule("ExpectedAppearancesLive")
     else:
         widget.enter()
