@@ -33,6 +33,7 @@ class LivePanel:
 
     def __init__(self, ui, controller: LiveController):
         self.ui, self.controller = ui, controller
+        controller.drawing_held = slicer.util.RenderBlocker
         self._parameter_node = None
         self._gui_tag = None
         self._message = ""
@@ -133,6 +134,8 @@ class LivePanel:
 
     def show_views(self) -> None:
         if slicer.app.layoutManager() is not None:
+            if self._parameter_node is not None:
+                self.layout.show_mri(self._parameter_node.mriVolume)
             self.controller.views = self.layout.enter()
 
     def fit(self) -> None:
