@@ -55,6 +55,7 @@ def registerSampleData():
     SampleData.SampleDataLogic.registerCustomSampleDataSource(
         category="Expected Appearances",
         sampleName="ExpectedAppearancesLivePhantom",
+        uris="",  # nothing is downloaded, but Slicer 5.8 counts them
         thumbnailFileName=str(icon),
         customDownloader=lambda _source=None: runSample(),
     )
@@ -65,7 +66,7 @@ def runSample():
     from ExpectedAppearancesLib.widgets.live_sample import run_sample
 
     widget = slicer.util.getModuleWidget("ExpectedAppearancesLive")
-    if slicer.util.mainWindow(verbose=False):
+    if slicer.util.mainWindow():
         slicer.util.selectModule("ExpectedAppearancesLive")
     else:
         widget.enter()
@@ -94,6 +95,7 @@ class ExpectedAppearancesLiveParameterNode:
     rateHz: Annotated[float, WithinRange(0.1, 100)] = 25.0
     longestPx: Annotated[int, WithinRange(256, 4096)] = 960
     staleMs: Annotated[int, WithinRange(50, 60000)] = 500
+    steady: bool = False
     outline: bool = True
     fill: bool = True
     fillOpacity: Annotated[float, WithinRange(0, 1)] = 0.35

@@ -80,6 +80,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/live/recording.py
   ExpectedAppearancesLib/live/session.py
   ExpectedAppearancesLib/live/sources.py
+  ExpectedAppearancesLib/live/steady.py
   ExpectedAppearancesLib/live/trust.py
   ExpectedAppearancesLib/live/worker.py
   ExpectedAppearancesLib/masks/__init__.py
@@ -104,6 +105,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/live_align.py
   ExpectedAppearancesLib/mrml/live_banner.py
   ExpectedAppearancesLib/mrml/live_controller.py
+  ExpectedAppearancesLib/mrml/live_drawing.py
   ExpectedAppearancesLib/mrml/live_record.py
   ExpectedAppearancesLib/mrml/live_scene.py
   ExpectedAppearancesLib/mrml/live_stream.py

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 
@@ -365,6 +366,32 @@ def test_replay_of_a_saved_scene_gives_the_same_frames_and_poses(application, ph
     assert live_record.recordings(loaded)
 
 
+def test_replay_shows_its_own_frame_after_the_session_went_on(application, phantom, model, frames):
+    """Recording ends, the session does not: the frame it leaves must not be shown with the recorded pose."""
+    scene, _logic = application
+    stream = node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    controller.start_recording()
+    send(stream, frames[1][3])
+    pose = wait_for(controller, lambda s: s.new).result.prediction.camera_from_world
+    browser = controller.stop_recording()
+    send(stream, frames[1][8])
+    wait_for(controller, lambda s: s.new)
+    controller.stop()
+    for _again in range(2):
+        assert controller.replay(browser).verdict.shows_overlay
+        np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][3])
+        expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(pose)
+        np.testing.assert_allclose(camera_to_ras_of(controller.live.transform), expected, atol=1e-6)
+        controller.start(choice_of(phantom, stale_s=60), model=model)  # its frames must not get into the recording
+        send(stream, frames[1][6])
+        wait_for(controller, lambda s: s.new)
+        controller.stop()
+    controller.close()
+
+
 def test_a_loaded_scene_shows_its_last_frame_without_overlay(application, phantom, model, frames):
     scene, _logic = application
     node_with(scene, frames[1][3])
@@ -521,9 +548,79 @@ def test_true_poses_are_collected_for_evaluation(application, phantom, model, fr
     controller.close()
 
 
+def test_frame_pose_and_overlay_change_while_nothing_is_drawn(application, phantom, model, frames):
+    """A busy Slicer draws at the first change already: the new frame with the outline of the one before."""
+    scene, _logic = application
+    stream = node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    held, outside, inside = [0], [], []
+
+    @contextlib.contextmanager
+    def drawing_held():
+        held[0] += 1
+        yield
+        held[0] -= 1
+
+    controller.drawing_held = drawing_held
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    watched = (controller.live.frame, controller.live.transform, *controller.live.lines.values())
+    watched += (controller.live.fill, controller.live.frustum)
+    events = ("ModifiedEvent", slicer.vtkMRMLTransformableNode.TransformModifiedEvent)
+    tags = [
+        (n, n.AddObserver(e, lambda caller, _e: (inside if held[0] else outside).append(caller.GetName())))
+        for n in watched
+        for e in events
+    ]
+    send(stream, frames[1][1])
+    wait_for(controller, lambda s: s.new)
+    controller.freeze()
+    controller.tick()
+    start = controller.begin_alignment().camera_from_world
+    controller.nudge(np.array([2.0, 0, 0]), np.zeros(3), start)
+    controller.finish_alignment()
+    controller.stop()
+    for node, tag in tags:
+        node.RemoveObserver(tag)
+    assert len(inside) > 5
+    assert outside == []
+    controller.close()
+
+
+def test_outline_stays_on_the_frame_when_the_frame_is_put_at_the_vessels(application, phantom, model, frames):
+    """Aligning puts the frame exactly at the vessels' depth; what is drawn over it must go with it."""
+    scene, _logic = application
+    node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    live, before_mm = controller.live, controller.live.plane_mm
+    live.put_plane_at(1.07 * before_mm)
+    assert live.plane_mm != before_mm
+    assert plane_of(live.frame) == pytest.approx(live.plane_mm)
+    assert plane_of(live.fill) == pytest.approx(live.plane_mm)
+    assert live.lines["outline"].GetPolyData().GetPoint(0)[2] == pytest.approx(live.plane_mm)
+    controller.close()
+
+
+def plane_of(volume) -> float:
+    import vtk
+
+    matrix = vtk.vtkMatrix4x4()
+    volume.GetIJKToRASMatrix(matrix)
+    return matrix.GetElement(2, 3)
+
+
 def test_layout_is_added_once_under_a_free_id():
     node = slicer.vtkMRMLLayoutNode()
     node.AddLayoutDescription(live_views.FIRST_LAYOUT_ID, "<layout/>")
     first = live_views.add_layout(node)
     assert first == live_views.FIRST_LAYOUT_ID + 1 > 100
     assert live_views.add_layout(node) == first
+    without = live_views.add_layout(node, with_mri=False)
+    assert without not in (first, live_views.FIRST_LAYOUT_ID)
+    assert live_views.MRI not in node.GetLayoutDescription(without)
+    for layout_id in (first, without):
+        assert node.GetLayoutDescription(layout_id).count("splitSize") == node.GetLayoutDescription(layout_id).count(
+            "<item"
+        )

@@ -22,6 +22,7 @@ from ExpectedAppearancesLib.live.choice import Choice, SourceKind, open_source, 
 from ExpectedAppearancesLib.live.feed import Feed, FeedState
 from ExpectedAppearancesLib.live.frames import FramePreparation, FrameSettings, picture_box
 from ExpectedAppearancesLib.live.overlay import OverlayMaker, winding
+from ExpectedAppearancesLib.live.steady import View
 from ExpectedAppearancesLib.live.trust import Controls, Shown, Sight, controls, judge
 from ExpectedAppearancesLib.live.worker import NewestWins
 from ExpectedAppearancesLib.registration.predictor import Prediction
@@ -429,8 +430,8 @@ def test_what_is_no_picture_is_said(image, words):
 NOW, STALE = 100.0, 0.5
 
 
-def shown(age=0.1, accepted=True, key="this", problem=""):
-    return Shown(NOW - age, key, accepted, 0.9, problem)
+def shown(age=0.1, accepted=True, key="this", problem="", view=None):
+    return Shown(NOW - age, key, accepted, 0.9, problem, view)
 
 
 @pytest.mark.parametrize(
@@ -441,6 +442,13 @@ def shown(age=0.1, accepted=True, key="this", problem=""):
         (Sight.STALE, {"shown": shown(age=STALE + 0.01)}),
         (Sight.STALE, {"shown": shown(age=float("nan"))}),
         (Sight.REFUSED, {"shown": shown(accepted=False)}),
+        (Sight.FOLLOWING, {"shown": shown(view=View.FOLLOWING)}),
+        (Sight.FOUND, {"shown": shown(view=View.FOUND)}),
+        (Sight.REFUSED, {"shown": shown(accepted=False, view=View.DOUBTED)}),
+        (Sight.REFUSED, {"shown": shown(accepted=False, view=View.FOUND)}),
+        (Sight.VIEW_LOST, {"shown": shown(accepted=False, view=View.LOST)}),
+        (Sight.STALE, {"shown": shown(age=2, view=View.FOUND)}),
+        (Sight.FROZEN, {"shown": shown(view=View.FOUND), "frozen": True}),
         (Sight.OTHER_CASE, {"shown": shown(key="other")}),
         (Sight.OTHER_CASE, {"shown": shown(key="other"), "frozen": True}),
         (Sight.UNUSABLE, {"shown": shown(problem="blank", accepted=False)}),
@@ -460,7 +468,7 @@ def shown(age=0.1, accepted=True, key="this", problem=""):
 def test_trust_as_a_table(sight, arguments):
     verdict = judge(**({"now_s": NOW, "case_key": "this", "stale_s": STALE, "running": True} | arguments))
     assert verdict.sight is sight
-    assert verdict.shows_overlay == (sight in (Sight.FOLLOWING, Sight.FROZEN))
+    assert verdict.shows_overlay == (sight in (Sight.FOLLOWING, Sight.FOUND, Sight.FROZEN))
 
 
 def test_controls_as_a_table():

@@ -15,23 +15,34 @@ class Silhouette:
     def __init__(self, vertices_mm: np.ndarray, triangles: np.ndarray):
         self._vertices_mm = np.asarray(vertices_mm, float)
         a, b, c = (self._vertices_mm[triangles[:, i]] for i in range(3))
-        self._face_normals, self._face_points_mm = np.cross(b - a, c - a), a
+        self._middle_mm = self._vertices_mm.mean(axis=0) if len(self._vertices_mm) else np.zeros(3)
+        self._face_normals = np.cross(b - a, c - a)
+        self._face_offsets = np.einsum("ij,ij->i", self._face_normals, a - self._middle_mm)
         edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
         count = len(self._vertices_mm)
-        keys, self._edge_of_side = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
+        keys, edge_of_side = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
         self._edges = np.stack([keys // count, keys % count], axis=1)
-        self._sides = np.bincount(self._edge_of_side, minlength=len(keys))
+        self._sides = np.bincount(edge_of_side.ravel(), minlength=len(keys))
+        # The triangles at each edge, those of one edge behind one another.
+        self._triangles_at = np.argsort(edge_of_side.ravel(), kind="stable") % max(1, len(triangles))
+        self._first_at = np.cumsum(self._sides) - self._sides
 
     def edges(self, camera_from_world: np.ndarray, facing_borders_only: bool = False) -> np.ndarray:
         """(E, 2) indices of the vertices of the outline's edges, from an OpenCV pose. Hidden outlines are included.
 
         facing_borders_only: leave out border edges of triangles that turn their back, which mostly hide behind others.
         """
-        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-        towards = np.einsum("ij,ij->i", self._face_normals, centre_mm - self._face_points_mm) > 0
-        facing = np.bincount(self._edge_of_side, np.tile(towards, 3), minlength=len(self._edges))
+        if not len(self._edges):
+            return self._edges
+        towards = self.towards(camera_from_world)
+        facing = np.add.reduceat(towards[self._triangles_at].astype(np.int32), self._first_at)
         border = (self._sides == 1) & (facing >= (1 if facing_borders_only else 0))
         return self._edges[border | ((facing > 0) & (facing < self._sides))]
+
+    def towards(self, camera_from_world: np.ndarray) -> np.ndarray:
+        """bool (F,): whether each triangle faces the camera."""
+        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+        return self._face_normals @ (centre_mm - self._middle_mm) > self._face_offsets
 
     def on_plane(self, camera_from_world: np.ndarray, plane_depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """The outline seen from the pose, drawn on the plane z = plane_depth_mm of the camera.

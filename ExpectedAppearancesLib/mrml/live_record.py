@@ -65,7 +65,14 @@ class Recorder:
             time_s,
             result.frame.name,
             result.camera,
-            Prediction(prediction.camera_from_world, result.accepted, prediction.confidence, prediction.latency_ms),
+            Prediction(
+                prediction.camera_from_world,
+                result.accepted,
+                prediction.confidence,
+                prediction.latency_ms,
+                prediction.covariance,
+            ),
+            steadied=result.steadied,
         )
         self._proxies[NOTE].SetText(to_note(frame, result.case_key))
         for role, sequence in self.sequences.items():
@@ -132,6 +139,17 @@ def frame_at(browser) -> tuple[RecordedFrame, str]:
     return from_note(note.GetText())
 
 
+def put_back(browser, live_scene: LiveScene) -> None:
+    """Put the recorded frame and transform that the browser is at into the live nodes.
+
+    Slicer does so when the browser moves; a session that went on after the recording has left its own last frame there.
+    """
+    for role, node in ((FRAME, live_scene.frame), (TRANSFORM, live_scene.transform)):
+        recorded = _sequence(browser, role).GetNthDataNode(browser.GetSelectedItemNumber())
+        if node is not None and recorded is not None:
+            node.CopyContent(recorded, True)  # deep: a session writes new pixels into the frame's own memory
+
+
 def export(browser, folder: Path, space: str) -> Path:
     """Write the frames, poses.json and a transform (.tfm, camera to Slicer's world) of each frame with a pose.
 
@@ -140,7 +158,7 @@ def export(browser, folder: Path, space: str) -> Path:
     folder = Path(folder)
     poses_path = export_recording(folder, (frame for frame, _key in recorded_frames(browser)))
     for number, (frame, _key) in enumerate(recorded_frames(browser, pixels=False)):
-        pose = frame.prediction.camera_from_world
+        pose = frame.camera_from_world
         if pose is not None:
             write_transform(folder / "transforms" / f"{number:05d}.tfm", camera_to_ras(pose, space))
     return poses_path

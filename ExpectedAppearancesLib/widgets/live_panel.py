@@ -33,6 +33,7 @@ class LivePanel:
 
     def __init__(self, ui, controller: LiveController):
         self.ui, self.controller = ui, controller
+        controller.drawing_held = slicer.util.RenderBlocker
         self._parameter_node = None
         self._gui_tag = None
         self._message = ""
@@ -114,6 +115,11 @@ class LivePanel:
         self._problem = self._missing or self.source.problem()
         self.ui.installButton.visible = bool(self._missing)
         self.controller.set_stale(p.staleMs / 1000)
+        try:
+            self.controller.set_steady(p.steady)
+        except ExpectedAppearancesError as error:
+            p.steady = False
+            self.say(str(error))
         options = OverlayOptions(p.outline, p.fill, p.fillOpacity, p.box)
         if options != self.controller.options:
             self.controller.set_options(options)
@@ -128,6 +134,8 @@ class LivePanel:
 
     def show_views(self) -> None:
         if slicer.app.layoutManager() is not None:
+            if self._parameter_node is not None:
+                self.layout.show_mri(self._parameter_node.mriVolume)
             self.controller.views = self.layout.enter()
 
     def fit(self) -> None:

@@ -61,7 +61,6 @@ def measure(inputs_folder: Path | None = None) -> dict:
 
 
 def _case(folder: Path, inputs_folder: Path | None):
-    from ExpectedAppearancesLib import files
     from ExpectedAppearancesLib.case.case import Case
     from ExpectedAppearancesLib.case.meshes import write_vtp
     from ExpectedAppearancesLib.demo.phantom import as_phantom
@@ -77,18 +76,20 @@ def _case(folder: Path, inputs_folder: Path | None):
     case = Case.create(folder / "case", *paths, camera)
     phantom = as_phantom(case)
     # In a process of its own: VTK and torch's exporter do not go together.
-    subprocess.run([sys.executable, __file__, "--write-network", str(case.model_folder / "model.onnx")], check=True)
-    meta = files.read_json(case.model_folder / "model.json", "model")
-    meta["model_sha256"] = files.sha256(case.model_folder / "model.onnx")
-    files.write_json(case.model_folder / "model.json", meta)
+    subprocess.run([sys.executable, __file__, "--write-network", str(case.model_folder)], check=True)
     return phantom
 
 
-def write_network(path: Path) -> None:
-    """The quick preset's network, untrained, plus the phantom's operations: the phantom's output at the real cost."""
+def write_network(folder: Path) -> None:
+    """The quick preset's network, untrained, plus the phantom's operations: the phantom's output at the real cost.
+
+    It replaces the phantom's in `folder`, a case's model folder.
+    """
     import torch
 
-    from ExpectedAppearancesLib.demo.phantom import GAIN, MIDDLE, SIZE_PX
+    from ExpectedAppearancesLib import files
+    from ExpectedAppearancesLib.demo.phantom import GAIN, MIDDLE
+    from ExpectedAppearancesLib.model.export import META_NAME, export_model
     from ExpectedAppearancesLib.model.networks import DenseSurfaceNet
     from ExpectedAppearancesLib.model.presets import PRESETS
 
@@ -105,17 +106,9 @@ def write_network(path: Path) -> None:
             read = torch.cat([coordinates, sigma, surface, torch.zeros_like(surface) - 1], dim=1)
             return read + 1e-12 * self.network(image)[:, :6]
 
-    network = Both().eval()
-    with torch.no_grad():
-        torch.onnx.export(
-            network,
-            (torch.rand(1, 3, SIZE_PX, SIZE_PX),),
-            str(path),
-            input_names=["image"],
-            output_names=["output"],
-            opset_version=17,
-            dynamo=False,
-        )
+    meta = files.read_json(folder / META_NAME, "model")
+    del meta["format_version"], meta["model_sha256"]
+    export_model(Both(), PRESETS["quick"], meta, folder)
 
 
 def _run_live(controller, view, phantom, poses, frames, update_ms: list, blocked_ms: list) -> None:
@@ -190,7 +183,7 @@ def _check(phantom, true: np.ndarray, predicted: np.ndarray | None) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=Path, metavar="DIR", help="vessels.vtp and cortex.vtp; else generated")
-    parser.add_argument("--write-network", type=Path, metavar="FILE", help=argparse.SUPPRESS)
+    parser.add_argument("--write-network", type=Path, metavar="DIR", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.write_network:
         write_network(args.write_network)
