@@ -15,6 +15,7 @@ from ..case.steps import STEPS, Step, StepState, next_step
 from ..mrml.planning_adopt import adopt
 from ..mrml.planning_session import PlanningSession
 from ..runs.closing import OnClose, close_runs, going_on, question
+from ..runs.runner import loaded_for_runs
 from ..runs.state import RunState, RunStatus
 from .planning_appearances import AppearancesSection
 from .planning_case import CaseSection, MicroscopeSection
@@ -133,6 +134,8 @@ class PlanningPanel:
                 self.session.busy = self.busy()
                 yield from self.session.prepare(self.parameters)
             self.refresh()
+            yield
+            yield from loaded_for_runs()
 
         self._stepper.start(pieces())
 
