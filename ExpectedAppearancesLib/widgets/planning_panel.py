@@ -157,11 +157,11 @@ class PlanningPanel:
                         slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
                     elif slicer.app.layoutManager():
                         slicer.util.resetThreeDViews()
-                        if self.parameters.mriVolume:
-                            slicer.util.setSliceViewerLayers(background=self.parameters.mriVolume, fit=True)
             finally:
                 self.loading = False
         self.refresh()
+        if take_over:
+            self.sections["case"].show_scan()
         self.unfold(self._next)
 
     def unfold(self, name: str) -> None:
