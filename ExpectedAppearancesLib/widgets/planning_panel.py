@@ -133,9 +133,8 @@ class PlanningPanel:
             if self.entered:
                 self.session.busy = self.busy()
                 yield from self.session.prepare(self.parameters)
-            self.refresh()
-            yield
-            yield from loaded_for_runs()
+                yield from loaded_for_runs()
+            self.refresh()  # the last: it stops what is still to be done
 
         self._stepper.start(pieces())
 
