@@ -225,7 +225,14 @@ def test_the_planning_panel_has_no_text_field_and_explains_what_is_chosen():
 
 def test_buttons_start_disabled_where_something_must_be_chosen_first():
     enabled = {w.get("name"): w.findtext("property[@name='enabled']/bool") for w in ui_root(MODULE).iter("widget")}
-    for name in ("saveCaseButton", "renderButton", "appearancesStart", "trainingStart", "showFiguresButton"):
+    for name in (
+        "saveCaseButton",
+        "renderButton",
+        "appearancesStart",
+        "trainingStart",
+        "studyStart",
+        "showFiguresButton",
+    ):
         assert enabled[name] == "false", name
 
 
