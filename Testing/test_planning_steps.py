@@ -151,6 +151,8 @@ STEEPER = {**POSES, "ranges": RANGES | {"tilt_max_deg": 60.0}}
         (lambda c, r: (c, replace(r, model=None)), "training", MISSING, "gone"),
         (lambda c, r: (c, replace(r, index=index(done=False))), "training", MISSING, "appearances first"),
         (lambda c, r: (replace(c, running=frozenset({"train"})), r), "training", RUNNING, "trained"),
+        (lambda c, r: (replace(c, running=frozenset({"study"})), r), "validation", RUNNING, "without it"),
+        (lambda c, r: (replace(c, scan_unsaved=True), r), "case", DONE, "without the MRI"),
         # Validation
         (lambda c, r: (c, replace(r, verdict=(False, ("a", "b")))), "validation", MISSING, "2 limits"),
         (lambda c, r: (c, replace(r, validation="stale")), "validation", STALE, "older"),
