@@ -55,6 +55,7 @@ def registerSampleData():
     SampleData.SampleDataLogic.registerCustomSampleDataSource(
         category="Expected Appearances",
         sampleName="ExpectedAppearancesLivePhantom",
+        uris="",  # nothing is downloaded, but Slicer 5.8 counts them
         thumbnailFileName=str(icon),
         customDownloader=lambda _source=None: runSample(),
     )
@@ -65,7 +66,7 @@ def runSample():
     from ExpectedAppearancesLib.widgets.live_sample import run_sample
 
     widget = slicer.util.getModuleWidget("ExpectedAppearancesLive")
-    if slicer.util.mainWindow(verbose=False):
+    if slicer.util.mainWindow():
         slicer.util.selectModule("ExpectedAppearancesLive")
     else:
         widget.enter()

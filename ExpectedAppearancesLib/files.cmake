@@ -23,6 +23,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/augmentation/impostors.py
   ExpectedAppearancesLib/augmentation/microscope.py
   ExpectedAppearancesLib/augmentation/surroundings.py
+  ExpectedAppearancesLib/cancelling.py
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py
@@ -58,6 +59,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/study.py
   ExpectedAppearancesLib/evaluation/study_figures.py
   ExpectedAppearancesLib/evaluation/study_folds.py
+  ExpectedAppearancesLib/evaluation/study_frames.py
   ExpectedAppearancesLib/evaluation/study_report.py
   ExpectedAppearancesLib/evaluation/verdict.py
   ExpectedAppearancesLib/executor.py
@@ -103,10 +105,12 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/live_align.py
   ExpectedAppearancesLib/mrml/live_banner.py
   ExpectedAppearancesLib/mrml/live_controller.py
+  ExpectedAppearancesLib/mrml/live_drawing.py
   ExpectedAppearancesLib/mrml/live_record.py
   ExpectedAppearancesLib/mrml/live_scene.py
   ExpectedAppearancesLib/mrml/live_stream.py
   ExpectedAppearancesLib/mrml/live_views.py
+  ExpectedAppearancesLib/mrml/mri.py
   ExpectedAppearancesLib/mrml/planning.py
   ExpectedAppearancesLib/mrml/planning_adopt.py
   ExpectedAppearancesLib/mrml/planning_session.py
@@ -143,6 +147,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
   ExpectedAppearancesLib/textures/proposal.py
+  ExpectedAppearancesLib/textures/thumbnails.py
   ExpectedAppearancesLib/widgets/__init__.py
   ExpectedAppearancesLib/widgets/labels.py
   ExpectedAppearancesLib/widgets/live_align.py

@@ -167,6 +167,32 @@ def test_panel_has_every_widget_that_the_code_uses(module):
     assert ui_root(module).find("widget").get("class") == "qMRMLWidget"
 
 
+@every_module
+def test_every_widget_has_a_name_of_its_own(module):
+    """The code finds a widget by its name: of two, one is shown and the other one is written to."""
+    names = [widget.get("name") for widget in ui_root(module).iter("widget")]
+    assert sorted(set(names)) == sorted(names)
+
+
+def test_no_menu_of_slicer_is_named_as_a_module():
+    """Slicer leaves a module out of its menus when a submenu has the title of another module."""
+    titles = {re.search(r'parent.title = _\("(.+)"\)', path.read_text(encoding="utf-8"))[1] for path in MODULES}
+    assert len(titles) == len(MODULES)
+    for path in FOLDER.glob("*/*.xml"):
+        assert not titles & set(ElementTree.parse(path).findtext("category").split("."))
+
+
+def test_sample_is_registered_as_slicer_asks():
+    """Slicer 5.8 takes the length of `uris` also where nothing is downloaded."""
+    calls = [
+        {keyword.arg: keyword.value for keyword in node.keywords}
+        for node in ast.walk(ast.parse((FOLDER / "ExpectedAppearancesLive.py").read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "registerCustomSampleDataSource"
+    ]
+    assert len(calls) == 1
+    assert isinstance(calls[0]["uris"].value, str)
+
+
 def test_every_planning_step_has_its_section():
     from ExpectedAppearancesLib.case.steps import STEPS
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 
@@ -258,9 +259,79 @@ def test_a_model_of_another_case_is_refused(phantom, tmp_path):
         open_model(other.case)
 
 
+def test_frame_pose_and_overlay_change_while_nothing_is_drawn(application, phantom, model, frames):
+    """A busy Slicer draws at the first change already: the new frame with the outline of the one before."""
+    scene, _logic = application
+    stream = node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    held, outside, inside = [0], [], []
+
+    @contextlib.contextmanager
+    def drawing_held():
+        held[0] += 1
+        yield
+        held[0] -= 1
+
+    controller.drawing_held = drawing_held
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    watched = (controller.live.frame, controller.live.transform, *controller.live.lines.values())
+    watched += (controller.live.fill, controller.live.frustum)
+    events = ("ModifiedEvent", slicer.vtkMRMLTransformableNode.TransformModifiedEvent)
+    tags = [
+        (n, n.AddObserver(e, lambda caller, _e: (inside if held[0] else outside).append(caller.GetName())))
+        for n in watched
+        for e in events
+    ]
+    send(stream, frames[1][1])
+    wait_for(controller, lambda s: s.new)
+    controller.freeze()
+    controller.tick()
+    start = controller.begin_alignment().camera_from_world
+    controller.nudge(np.array([2.0, 0, 0]), np.zeros(3), start)
+    controller.finish_alignment()
+    controller.stop()
+    for node, tag in tags:
+        node.RemoveObserver(tag)
+    assert len(inside) > 5
+    assert outside == []
+    controller.close()
+
+
+def test_outline_stays_on_the_frame_when_the_frame_is_put_at_the_vessels(application, phantom, model, frames):
+    """Aligning puts the frame exactly at the vessels' depth; what is drawn over it must go with it."""
+    scene, _logic = application
+    node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    live, before_mm = controller.live, controller.live.plane_mm
+    live.put_plane_at(1.07 * before_mm)
+    assert live.plane_mm != before_mm
+    assert plane_of(live.frame) == pytest.approx(live.plane_mm)
+    assert plane_of(live.fill) == pytest.approx(live.plane_mm)
+    assert live.lines["outline"].GetPolyData().GetPoint(0)[2] == pytest.approx(live.plane_mm)
+    controller.close()
+
+
+def plane_of(volume) -> float:
+    import vtk
+
+    matrix = vtk.vtkMatrix4x4()
+    volume.GetIJKToRASMatrix(matrix)
+    return matrix.GetElement(2, 3)
+
+
 def test_layout_is_added_once_under_a_free_id():
     node = slicer.vtkMRMLLayoutNode()
     node.AddLayoutDescription(live_views.FIRST_LAYOUT_ID, "<layout/>")
     first = live_views.add_layout(node)
     assert first == live_views.FIRST_LAYOUT_ID + 1 > 100
     assert live_views.add_layout(node) == first
+    without = live_views.add_layout(node, with_mri=False)
+    assert without not in (first, live_views.FIRST_LAYOUT_ID)
+    assert live_views.MRI not in node.GetLayoutDescription(without)
+    for layout_id in (first, without):
+        assert node.GetLayoutDescription(layout_id).count("splitSize") == node.GetLayoutDescription(layout_id).count(
+            "<item"
+        )

@@ -32,7 +32,7 @@ def link():
     port = free_port()
     server = pyigtl.OpenIGTLinkServer(port=port, local_server=True)
     client = pyigtl.OpenIGTLinkClient(host="127.0.0.1", port=port)
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60
     while not (server.is_connected() and client.is_connected()):
         assert time.monotonic() < end, "no connection on the loopback interface"
         time.sleep(0.01)

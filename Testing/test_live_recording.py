@@ -62,6 +62,32 @@ def test_replay_of_a_saved_scene_gives_the_same_frames_and_poses(application, ph
     assert live_record.recordings(loaded)
 
 
+def test_replay_shows_its_own_frame_after_the_session_went_on(application, phantom, model, frames):
+    """Recording ends, the session does not: the frame it leaves must not be shown with the recorded pose."""
+    scene, _logic = application
+    stream = node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    controller.start_recording()
+    send(stream, frames[1][3])
+    pose = wait_for(controller, lambda s: s.new).result.prediction.camera_from_world
+    browser = controller.stop_recording()
+    send(stream, frames[1][8])
+    wait_for(controller, lambda s: s.new)
+    controller.stop()
+    for _again in range(2):
+        assert controller.replay(browser).verdict.shows_overlay
+        np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][3])
+        expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(pose)
+        np.testing.assert_allclose(camera_to_ras_of(controller.live.transform), expected, atol=1e-6)
+        controller.start(choice_of(phantom, stale_s=60), model=model)  # its frames must not get into the recording
+        send(stream, frames[1][6])
+        wait_for(controller, lambda s: s.new)
+        controller.stop()
+    controller.close()
+
+
 def test_a_loaded_scene_shows_its_last_frame_without_overlay(application, phantom, model, frames):
     scene, _logic = application
     node_with(scene, frames[1][3])

@@ -180,3 +180,19 @@ def test_3d_slicer_reads_the_space_that_was_written(tmp_path):
         storage.SetCoordinateSystem(storage.CoordinateSystemRAS)
         assert storage.WriteData(node)
         assert declared_space(tmp_path / "b.vtp") == "RAS"
+
+
+def test_a_simplified_surface_has_few_triangles_and_stays_where_it_was():
+    """A sphere of 30 mm in triangles of 10 mm2: against the sphere itself, and its area."""
+    source = vtk.vtkSphereSource()
+    source.SetRadius(30)
+    source.SetThetaResolution(200)
+    source.SetPhiResolution(200)
+    source.Update()
+    fine = Mesh.from_polydata(source.GetOutput())
+    assert fine.area_mm2 == pytest.approx(4 * np.pi * 900, rel=1e-3)
+    coarse = fine.simplified(10.0)
+    assert len(coarse.triangles) == pytest.approx(fine.area_mm2 / 10, rel=0.02) and len(fine.triangles) > 70_000
+    middles = coarse.vertices_mm[coarse.triangles].mean(axis=1)
+    assert np.abs(np.linalg.norm(middles, axis=1) - 30).max() < 0.3
+    assert coarse.simplified(10.0 * coarse.area_mm2 / fine.area_mm2 / 1.1) is coarse

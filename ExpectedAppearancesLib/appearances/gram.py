@@ -30,7 +30,8 @@ def _gram(rows: torch.Tensor) -> torch.Tensor:
     """(B, P, K) -> (B, K, K) float32; P is less than PIXELS_PER_SUM or a multiple of it."""
     batch, pixels, channels = rows.shape
     sums = rows.reshape(-1, min(PIXELS_PER_SUM, pixels), channels)
-    return torch.bmm(sums.transpose(1, 2), sums).view(batch, -1, channels, channels).float().sum(dim=1)
+    sums = torch.bmm(sums.transpose(1, 2), sums).view(batch, -1, channels, channels).float()
+    return sums[:, 0] if sums.shape[1] == 1 else sums.sum(dim=1)
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,8 @@ class ClassTerm:
         batch, channels = len(self.target), rows.shape[1]
         own = rows.index_select(0, self.pixels).view(batch, -1, channels)
         own[:, self.full :] *= self.soft
-        difference = _gram(own) / self.elements - self.target
+        # In place: deep layers' matrices are larger than their features.
+        difference = _gram(own).div_(self.elements).sub_(self.target)
         distance = (difference.square().sum(dim=2) * self.weight[:, 0]).sum(dim=1)
         if gradient_rows is not None:
             difference *= 4 * self.weight / self.elements

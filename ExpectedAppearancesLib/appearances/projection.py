@@ -85,18 +85,21 @@ class SurfacePainter:
         light /= np.linalg.norm(light)
         half = light + towards_camera
         half /= np.linalg.norm(half)
-        normals = _look_up(self._normals, where_px)
-        cosines = cv2.transform(normals, np.stack([light, half]).astype(np.float32))
+        # Light changes slowly: half the resolution holds it.
+        height, width = labels.shape
+        coarse = cv2.resize(where_px, (width // 2, height // 2), interpolation=cv2.INTER_NEAREST)
+        cosines = cv2.transform(_look_up(self._normals, coarse), np.stack([light, half]).astype(np.float32))
         strength = np.float32(rng.uniform(0, 0.8))
         shade = np.maximum(cosines[..., 0], 0) * strength + (1 - strength)
         tint = rng.uniform(0, 0.2)
         blotches = rng.uniform(1 - tint, 1 + tint, (*rng.integers(2, 6, 2), 3)).astype(np.float32)
-        blotches = cv2.resize(blotches, labels.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        image = cv2.multiply(image, cv2.multiply(blotches, cv2.merge([shade] * 3)), dtype=cv2.CV_8U)
+        blotches = cv2.resize(blotches, shade.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        colour = cv2.resize(cv2.multiply(blotches, cv2.merge([shade] * 3)), (width, height))
+        image = cv2.multiply(image, colour, dtype=cv2.CV_8U)
         if rng.uniform() < GLOSS:
             sharpness, amount = np.exp(rng.uniform(np.log(8), np.log(80))), rng.uniform(0.1, 0.8)
             gleam = cv2.pow(np.clip(cosines[..., 1], 0, 1), sharpness) * np.float32(255 * amount)
-            gleam[labels == BACKGROUND] = 0
+            gleam = cv2.copyTo(cv2.resize(gleam, (width, height)), labels)
             image = cv2.add(image, cv2.merge([gleam] * 3), dtype=cv2.CV_8U)
         return image
 

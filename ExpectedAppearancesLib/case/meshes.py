@@ -48,6 +48,25 @@ class Mesh:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
 
+    @property
+    def area_mm2(self) -> float:
+        """Sum of the triangles' areas."""
+        a, b, c = (self.vertices_mm[self.triangles[:, i]] for i in range(3))
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+    def simplified(self, triangle_mm2: float) -> Mesh:
+        """The surface in triangles of that mean area, by quadric error; itself where they are no smaller now."""
+        from vtkmodules.vtkFiltersCore import vtkQuadricDecimation
+
+        kept = self.area_mm2 / triangle_mm2 / max(len(self.triangles), 1)
+        if kept >= 1:
+            return self
+        decimation = vtkQuadricDecimation()
+        decimation.SetInputData(self.to_polydata())
+        decimation.SetTargetReduction(1 - kept)
+        decimation.Update()
+        return Mesh.from_polydata(decimation.GetOutput())
+
     def to_polydata(self):
         """vtkPolyData of its own memory, with point normals."""
         from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray

@@ -54,6 +54,7 @@ class MaskRenderer:
     """
 
     _COLOUR_STEP = 100  # labels are drawn as grey 0, 100, 200: far apart, so that a driver's rounding cannot mix them
+    _LABEL_OF_GREY = ((np.arange(256) + _COLOUR_STEP // 2) // _COLOUR_STEP).astype(np.uint8)
 
     def __init__(self, vessels: Mesh, parenchyma: Mesh, camera: Camera, circular_field: float | None = None):
         self.camera = camera.without_distortion()
@@ -101,14 +102,13 @@ class MaskRenderer:
             self._window.GetZbufferData(0, 0, width - 1, height - 1, self._depths)
         import cv2  # not at the top: label maps alone are drawn where it is not installed
 
-        z = vtk_to_numpy(self._depths).reshape(height, width)[::-1]
-        nothing = labels == BACKGROUND
-        depth_mm = np.float32(far * near) / (np.float32(far) - z * np.float32(far - near))
-        depth_mm[nothing] = 0
+        z = cv2.flip(vtk_to_numpy(self._depths).reshape(height, width), 0)
+        # What has no label is left out by the masks.
+        depth_mm = cv2.copyTo(np.float32(far * near) / (np.float32(far) - z * np.float32(far - near)), labels)
         world_from_camera = inverse(np.asarray(camera_from_world, float))
         # Single precision is good for a micrometre here, and many times faster.
-        points = cv2.transform(self._rays * depth_mm[..., None], world_from_camera[:3].astype(np.float32))
-        points[nothing] = 0
+        rays_mm = cv2.multiply(self._rays, cv2.merge([depth_mm] * 3))
+        points = cv2.copyTo(cv2.transform(rays_mm, world_from_camera[:3].astype(np.float32)), labels)
         return labels, depth_mm, points
 
     def close(self) -> None:
@@ -133,8 +133,7 @@ class MaskRenderer:
         width, height = self.camera.width, self.camera.height
         self._window.GetPixelData(0, 0, width - 1, height - 1, 0, self._pixels, 0)
         grey = vtk_to_numpy(self._pixels).reshape(height, width, 3)[::-1, :, 0]
-        labels = (grey.astype(np.uint16) + self._COLOUR_STEP // 2) // self._COLOUR_STEP
-        labels = labels.astype(np.uint8)
+        labels = self._LABEL_OF_GREY[grey]
         if self._outside is not None:
             labels[self._outside] = BACKGROUND
         return labels

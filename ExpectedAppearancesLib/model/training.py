@@ -16,6 +16,7 @@ import torch
 
 from .. import files
 from ..appearances.store import folder_of, read_appearances
+from ..cancelling import cancelling_waits
 from ..case.case import Case
 from ..case.meshes import write_vtp
 from ..devices import fast_dtype
@@ -161,11 +162,13 @@ class _Trainer:
         use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
-        with Feeder(self.case.folder, self.views, preset.fresh, first, _feeder_workers(self.device)) as feeder:
+        workers = _feeder_workers(self.device)
+        with Feeder(self.case.folder, self.views, preset.fresh, first, workers) as feeder, cancelling_waits() as stop:
             memory = ViewMemory(feeder, preset.batch, preset.remembered, self.views.seed)
             while True:
                 done = max(state["step"] / preset.steps, state["seconds"] / 60 / preset.minutes)
-                if done >= 1:
+                if done >= 1 or stop.asked:
+                    self._save()
                     break
                 batch = memory.next(state["step"])
                 state["drawn"] = first + memory.drawn
@@ -193,7 +196,8 @@ class _Trainer:
                 if time.monotonic() - saved > CHECKPOINT_EVERY_S:
                     self._save()
                     saved = time.monotonic()
-        self._validate(validation, recent)
+        if not state["curve"] or state["curve"][-1]["step"] != state["step"]:
+            self._validate(validation, recent)
         self._save()
 
     def export(self, calibration: Batch, validation: Batch, on_record: dict) -> dict:

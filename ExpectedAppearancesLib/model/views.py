@@ -15,7 +15,7 @@ from ..appearances.projection import SurfacePainter
 from ..appearances.store import Appearance, read_appearances
 from ..augmentation import elastic, microscope
 from ..augmentation.impostors import impostor
-from ..augmentation.surroundings import fill_outside, opening
+from ..augmentation.surroundings import continue_tissue, fill_outside, opening
 from ..case.case import Case
 from ..geometry.pose import pose_from_rotation, rotation_matrix
 from ..masks.labels import BACKGROUND, VESSELS
@@ -26,6 +26,7 @@ from .encoding import network_camera
 from .fold import known_poses, seen_from
 
 COMPOSED_PX = 256  # smaller views are composed at twice their size, then averaged: frames are anti-aliased too
+DRAWN_TRIANGLE_PX = 4.0  # area, seen from afar: software rendering of smaller ones costs much and shows nothing
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,10 @@ class ViewSource:
         self.camera = network_camera(self.case.camera, settings.size_px)
         self._oversampling = 2 if 2 * settings.size_px <= COMPOSED_PX else 1
         self._large = self.camera.resized(*(2 * [settings.size_px * self._oversampling]))
-        self._renderer = MaskRenderer(self.case.vessels, parenchyma, self._large)
         self._sampler: PoseSampler = sampler_of(self.case, settings.seed)
+        farthest_px_mm = max(self._sampler.ranges.working_distance_mm) / self._large.fx
+        drawn = [mesh.simplified(DRAWN_TRIANGLE_PX * farthest_px_mm**2) for mesh in (self.case.vessels, parenchyma)]
+        self._renderer = MaskRenderer(*drawn, self._large)
         _, appearances = read_appearances(self.case, settings.method)
         self._appearances = [a for a in appearances if a.style in settings.styles]
         self._poses = known_poses(Path(settings.poses_file)) if settings.poses_file else None
@@ -85,8 +88,9 @@ class ViewSource:
         across = parenchyma.vertices_mm @ self._frontal.T
         self._middle_mm = (across.min(axis=0) + across.max(axis=0)) / 2
         self._extent_mm = float((across.max(axis=0) - across.min(axis=0)).mean())
-        rows, columns = np.mgrid[0 : self._large.height, 0 : self._large.width]
-        self._grid = np.stack([columns, rows], axis=-1).astype(np.float32)
+        # Where in the composed view the cells' centres lie.
+        middles = (np.arange(settings.size_px // 2, dtype=np.float32) + 0.5) * 2 * self._oversampling - 0.5
+        self._cells_px = np.stack(np.meshgrid(middles, middles), axis=-1)
         frame = self.case.camera
         scale = self._large.width / max(frame.width, frame.height)
         self._bars = (
@@ -114,7 +118,10 @@ class ViewSource:
         if hidden is not None:
             labels *= hidden
         self._clear_bars(labels, 1)
-        image = fill_outside(image, labels == BACKGROUND, cortex, rng)
+        tissue = labels != BACKGROUND
+        if hidden is None:
+            image, tissue = continue_tissue(image, tissue.astype(np.uint8), rng)
+        image = fill_outside(image, ~tissue, cortex, rng)
         return self._finish(image, pose, labels, points, rng)
 
     def close(self) -> None:
@@ -141,6 +148,7 @@ class ViewSource:
     def _finish(self, image, pose, labels, points, rng) -> View:
         size = self.settings.size_px
         small = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA) if len(image) > size else image
+        cells_px = self._cells_px
         if self.settings.elastic_px > 0:
             # Smooth: a coarse field holds it. Its unit is a pixel of 128.
             amplitude = self.settings.elastic_px / 2 * rng.uniform()
@@ -148,12 +156,10 @@ class ViewSource:
             field = cv2.resize(coarse * np.float32(size / 64), (size, size), interpolation=cv2.INTER_LINEAR)
             small = elastic.warp(small, field)
             # The brain moves and takes its points along: what a pixel shows stays true, the pose's mean does too.
-            large = cv2.resize(coarse * np.float32(len(labels) / 64), labels.shape[::-1])
-            moved = self._grid + large
-            labels = cv2.remap(labels, moved, None, cv2.INTER_NEAREST)
-            points = cv2.remap(points, moved, None, cv2.INTER_NEAREST)
+            moved = cv2.resize(coarse, cells_px.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+            cells_px = cells_px + moved * np.float32(len(labels) / 64)
         small = microscope.apply(small, rng)
-        points, surface, vessels = _to_grid(points, labels, 2 * self._oversampling)
+        points, surface, vessels = _to_grid(points, labels, cells_px)
         if rng.uniform() < self.settings.negatives:
             small = impostor(small, rng)
             surface, vessels = np.zeros_like(surface), np.zeros_like(vessels)
@@ -170,20 +176,16 @@ class ViewSource:
         array[:, :columns], array[:, array.shape[1] - columns :] = 0, 0
 
 
-def _to_grid(points_mm: np.ndarray, labels: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cells of step x step pixels: the surface point at each cell's centre, mean of the four pixels around it.
+def _to_grid(
+    points_mm: np.ndarray, labels: np.ndarray, cells_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The surface point (G, G, 3) at each cell's centre (G, G, 2), between the four pixels around it; and whether it is
+    surface, and vessel.
 
     A cell counts as surface only where all four see it, so that no point is averaged with nothing.
     """
-    low, high = step // 2 - 1, step // 2
-    corners = [(low, low), (low, high), (high, low), (high, high)]
-    surface = np.ones([n // step for n in labels.shape], bool)
-    total = np.zeros((*surface.shape, 3), np.float32)
-    vessels = np.zeros(surface.shape, np.float32)
-    for row, column in corners:
-        own = labels[row::step, column::step]
-        surface &= own != BACKGROUND
-        vessels += own == VESSELS
-        total += points_mm[row::step, column::step]
-    total[~surface] = 0
-    return total / 4, surface.astype(np.uint8), (vessels >= 2).astype(np.uint8)
+    surface = cv2.remap((labels != BACKGROUND).astype(np.float32), cells_px, None, cv2.INTER_LINEAR) > 0.9999
+    vessels = cv2.remap((labels == VESSELS).astype(np.float32), cells_px, None, cv2.INTER_LINEAR) >= 0.5
+    points = cv2.remap(points_mm, cells_px, None, cv2.INTER_LINEAR)
+    surface = surface.astype(np.uint8)
+    return cv2.copyTo(points, surface), surface, vessels.astype(np.uint8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from ..live.trust import Sight, Verdict
 from ..poses.craniotomy import find_craniotomy
 from . import live_record
 from .live_align import Alignment, pose_of_landmarks
+from .live_drawing import at_once
 from .live_scene import FRAME, LiveScene, OverlayOptions, node_of_role, remove_live_nodes
 from .live_stream import NodeFrames
 
@@ -61,11 +63,15 @@ IDLE = Status(Verdict(Sight.IDLE))
 
 
 class LiveController:
-    """Owns the session, its nodes in `scene`, the recording and the alignment. `close` leaves nothing behind."""
+    """Owns the session, its nodes in `scene`, the recording and the alignment. `close` leaves nothing behind.
+
+    drawing_held: gives the context in which no view is drawn, in Slicer slicer.util.RenderBlocker.
+    """
 
     def __init__(self, scene, views: Views | None = None, clock: Callable[[], float] = time.monotonic):
         self._scene, self._clock = scene, clock
         self.views = views
+        self.drawing_held: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
         self.options = OverlayOptions()
         self.case: Case | None = None
         self.live: LiveScene | None = None
@@ -111,6 +117,7 @@ class LiveController:
             self.live.set_options(self.options)
         return self.case
 
+    @at_once
     def restore(self, case_path: Path, camera: Camera) -> bool:
         """Show the frame that a saved scene brought, as `camera` took it, without overlay. False where there is none.
 
@@ -126,6 +133,7 @@ class LiveController:
     def start(self, choice: Choice, single: bool = False, model: OpenedModel | None = None) -> None:
         """Begin to register what was chosen. single: hold the first frame. Raises InputError with what is wrong."""
         self.stop()
+        self._replayed = None
         opened = open_source(choice)
         node = self._node(choice) if choice.kind is SourceKind.NODE else None
         case = self.open_case(choice.case_path)
@@ -142,6 +150,7 @@ class LiveController:
             self._stream = NodeFrames(self._scene, node, self._session.push, self._clock)
         self.tick()
 
+    @at_once
     def stop(self) -> None:
         """End the session. The last frame stays, without its overlay."""
         self.finish_alignment(keep=False)
@@ -180,12 +189,14 @@ class LiveController:
         if self._session is not None:
             self._session.freeze()
 
+    @at_once
     def resume(self) -> None:
         self.finish_alignment(keep=False)
         self._forget_truth()
         if self._session is not None:
             self._session.resume()
 
+    @at_once
     def next_frame(self) -> None:
         """Register one more frame and hold it."""
         self.finish_alignment(keep=False)
@@ -204,10 +215,12 @@ class LiveController:
                 check_can_steady(self._model.estimator, self.case.model_folder)
             self._session.steady = steady
 
+    @at_once
     def fit_views(self) -> None:
         """Show the whole frame again."""
         self._follow(True)
 
+    @at_once
     def set_options(self, options: OverlayOptions) -> None:
         self.options = options
         if self.live is not None:
@@ -225,27 +238,13 @@ class LiveController:
             self._session.say_source(self._stream.look())
         update = self._session.tick(wait_s)
         begin = time.perf_counter()
-        changed = False
-        if update.new is not None:
-            self._forget_truth()
-            changed = self.live.show(update.new)
-        elif update.shown is not None and not self.live.intact:
-            live_record.pause_playback(self._scene)
-            changed = self.live.show(update.shown)
-        visible = update.verdict.shows_overlay
-        self.live.set_overlay_visible(visible)
-        if update.new is not None or visible != self._was_visible():
-            self._follow(changed)
-        if update.new is not None and self.recorder is not None:
-            self.recorder.add(update.new)
-        if self.alignment is not None:
-            self.show_truth(self.alignment.camera_from_world)
-        self.status = self._status(update)
+        self._show(update)
         if update.new is not None:
             self.shown_in_ms = (time.perf_counter() - begin) * 1000
         return self.status
 
     # -------------------------------------------------------------------------------------------------------- truth
+    @at_once
     def begin_alignment(self) -> Alignment:
         """Let the vessels be moved over the frame that is held. Raises InputError when none is held."""
         result = self.result
@@ -263,6 +262,7 @@ class LiveController:
         self.show_truth(start)
         return self.alignment
 
+    @at_once
     def nudge(self, shift_mm: np.ndarray, turn_deg: np.ndarray, start: np.ndarray) -> None:
         """Move the vessels from `start` as the sliders say, in the camera's axes."""
         if self.alignment is not None:
@@ -272,6 +272,7 @@ class LiveController:
         """Where the sliders would have to be for the vessels as they lie now: shift mm, turn deg."""
         return nudge_between(start, self.alignment.camera_from_world, self.case.vessels.centroid_mm)
 
+    @at_once
     def align_to_landmarks(self, in_frame, on_mesh) -> float:
         """Move the vessels to where the pairs say; returns the root mean square error, px. Raises InputError."""
         if self.alignment is None:
@@ -281,6 +282,7 @@ class LiveController:
         self.show_truth(found.camera_from_world)
         return found.rms_px
 
+    @at_once
     def finish_alignment(self, keep: bool = True) -> None:
         if self.alignment is None:
             return
@@ -291,6 +293,7 @@ class LiveController:
         if result is not None and result.accepted and self.live is not None:
             self.live.set_pose(result.camera_from_world)  # what was predicted is what the views follow
 
+    @at_once
     def show_truth(self, camera_from_world: np.ndarray | None) -> None:
         """Draw the true outline over the frame that is held."""
         if camera_from_world is not None and self.truth is not None and np.allclose(camera_from_world, self.truth):
@@ -325,6 +328,7 @@ class LiveController:
         recorder, self.recorder = self.recorder, None
         return recorder.finish() if recorder is not None else None
 
+    @at_once
     def replay(self, browser) -> Status:
         """Draw the overlay of the recorded frame that `browser` is at; call it whenever it may have moved."""
         key = (browser.GetID(), browser.GetSelectedItemNumber(), id(self.live))
@@ -335,6 +339,7 @@ class LiveController:
         verdict = Verdict(Sight.FROZEN if frame.prediction.accepted else Sight.REFUSED)
         if recorded_key != case_key(self.case):
             verdict = Verdict(Sight.OTHER_CASE)
+        live_record.put_back(browser, self.live)
         changed = self.live.take_replayed(frame.camera)
         if verdict.shows_overlay:
             pose = frame.camera_from_world
@@ -352,6 +357,25 @@ class LiveController:
         return self.status
 
     # ----------------------------------------------------------------------------------------------------- internal
+    @at_once
+    def _show(self, update: Update) -> None:
+        changed = False
+        if update.new is not None:
+            self._forget_truth()
+            changed = self.live.show(update.new)
+        elif update.shown is not None and not self.live.intact:
+            live_record.pause_playback(self._scene)
+            changed = self.live.show(update.shown)
+        visible = update.verdict.shows_overlay
+        self.live.set_overlay_visible(visible)
+        if update.new is not None or visible != self._was_visible():
+            self._follow(changed)
+        if update.new is not None and self.recorder is not None:
+            self.recorder.add(update.new)
+        if self.alignment is not None:
+            self.show_truth(self.alignment.camera_from_world)
+        self.status = self._status(update)
+
     def _node(self, choice: Choice):
         node = self._scene.GetNodeByID(choice.node_name) or self._scene.GetFirstNodeByName(choice.node_name)
         if node is None or not node.IsA("vtkMRMLVolumeNode"):

@@ -139,6 +139,17 @@ def frame_at(browser) -> tuple[RecordedFrame, str]:
     return from_note(note.GetText())
 
 
+def put_back(browser, live_scene: LiveScene) -> None:
+    """Put the recorded frame and transform that the browser is at into the live nodes.
+
+    Slicer does so when the browser moves; a session that went on after the recording has left its own last frame there.
+    """
+    for role, node in ((FRAME, live_scene.frame), (TRANSFORM, live_scene.transform)):
+        recorded = _sequence(browser, role).GetNthDataNode(browser.GetSelectedItemNumber())
+        if node is not None and recorded is not None:
+            node.CopyContent(recorded, True)  # deep: a session writes new pixels into the frame's own memory
+
+
 def export(browser, folder: Path, space: str) -> Path:
     """Write the frames, poses.json and a transform (.tfm, camera to Slicer's world) of each frame with a pose.
 

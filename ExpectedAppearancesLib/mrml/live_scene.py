@@ -119,9 +119,11 @@ class LiveScene:
         return self._put_plane(camera, matrix.GetElement(2, 3))
 
     def put_plane_at(self, depth_mm: float) -> None:
-        """Put the frame that is shown at that distance from the camera."""
+        """Put the frame that is shown at that distance from the camera, and what is drawn over it with it."""
         if self._put_plane(self.camera, depth_mm):
             self._place_frame()
+            self._place_fill(self.camera)
+            self._draw_lines_again()
 
     def set_pose(self, camera_from_world: np.ndarray) -> None:
         self.camera_to_ras = camera_to_ras(camera_from_world, self._case.space)
@@ -133,10 +135,9 @@ class LiveScene:
         """Outline, box and fill of a pose, onto the image plane."""
         self._draw_lines(OUTLINE, camera, overlay.outline_px, overlay.outline_lines)
         self._draw_lines(BOX, camera, overlay.box_px, overlay.box_lines)
-        small = camera.resized(overlay.fill.shape[1], overlay.fill.shape[0])
         was_modifying = self.fill.StartModify()
-        self.fill.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(small, self.plane_mm)))
         _set_image(self.fill, overlay.fill[..., None])
+        self._place_fill(camera)
         self.fill.EndModify(was_modifying)
 
     def show_truth(self, overlay: Overlay | None, camera: Camera | None) -> None:
@@ -152,8 +153,16 @@ class LiveScene:
         """
         if abs(view_pixel_mm - self._view_pixel_mm) > 0.02 * view_pixel_mm:
             self._view_pixel_mm = view_pixel_mm
-            for role, drawn in self._drawn.items():
-                self._draw_lines(role, *drawn)
+            self._draw_lines_again()
+
+    def show_lines_in(self, view_ids: tuple[str, ...]) -> None:
+        """Draw the lines in these views only; () for all. An edge-on outline would be a stroke across the MRI."""
+        for node in self.lines.values():
+            display = node.GetDisplayNode()
+            if tuple(display.GetViewNodeIDs()) != view_ids:
+                display.RemoveAllViewNodeIDs()
+                for view_id in view_ids:
+                    display.AddViewNodeID(view_id)
 
     def set_overlay_visible(self, visible: bool) -> None:
         """Show or hide all that depends on the pose: outline, fill, box and frustum."""
@@ -233,6 +242,10 @@ class LiveScene:
         self.frame.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(self.camera, self.plane_mm)))
         self.frame.SetAndObserveTransformNodeID(self.transform.GetID())
 
+    def _place_fill(self, camera: Camera) -> None:
+        small = camera.resized(*self.fill.GetImageData().GetDimensions()[:2])
+        self.fill.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(small, self.plane_mm)))
+
     def _add_lines(self, role: str):
         from vtkmodules.vtkCommonDataModel import vtkPolyData
 
@@ -252,6 +265,10 @@ class LiveScene:
         display.SetSliceIntersectionThickness(3 if role == TRUTH else 2)
         display.SetVisibility(False)
         return node
+
+    def _draw_lines_again(self) -> None:
+        for role, drawn in self._drawn.items():
+            self._draw_lines(role, *drawn)
 
     def _draw_lines(self, role: str, camera: Camera, points_px: np.ndarray, lines: np.ndarray) -> None:
         self._drawn[role] = (camera, points_px, lines)

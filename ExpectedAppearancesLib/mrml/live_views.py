@@ -15,10 +15,10 @@ MICROSCOPE, THROUGH, OVERVIEW, MRI = "Microscope", "MicroscopeCamera", "Microsco
 DEPTH_VIEW_FRAMES = 2.5  # how many frames high the MRI's slice along the optical axis is shown
 FIRST_LAYOUT_ID = 617  # free ids are sought from here on; Slicer's own end below 100
 
-LAYOUT = f"""
+_VIEWS = """
 <layout type="horizontal" split="true">
  <item splitSize="620">
-  <view class="vtkMRMLSliceNode" singletontag="{MICROSCOPE}">
+  <view class="vtkMRMLSliceNode" singletontag="{microscope}">
    <property name="orientation" action="default">Axial</property>
    <property name="viewlabel" action="default">M</property>
    <property name="viewcolor" action="default">#2E6FDB</property>
@@ -26,37 +26,54 @@ LAYOUT = f"""
  </item>
  <item splitSize="380">
   <layout type="vertical" split="true">
-   <item>
-    <view class="vtkMRMLViewNode" singletontag="{OVERVIEW}">
+   <item splitSize="330">
+    <view class="vtkMRMLViewNode" singletontag="{overview}">
      <property name="viewlabel" action="default">O</property>
     </view>
    </item>
-   <item>
-    <view class="vtkMRMLViewNode" singletontag="{THROUGH}">
+   <item splitSize="330">
+    <view class="vtkMRMLViewNode" singletontag="{through}">
      <property name="viewlabel" action="default">C</property>
     </view>
-   </item>
-   <item>
-    <view class="vtkMRMLSliceNode" singletontag="{MRI}">
-     <property name="orientation" action="default">Axial</property>
-     <property name="viewlabel" action="default">D</property>
-     <property name="viewcolor" action="default">#8C6BB1</property>
-    </view>
-   </item>
+   </item>{depth}
   </layout>
  </item>
 </layout>
 """
+_DEPTH_VIEW = """
+   <item splitSize="330">
+    <view class="vtkMRMLSliceNode" singletontag="{mri}">
+     <property name="orientation" action="default">Axial</property>
+     <property name="viewlabel" action="default">D</property>
+     <property name="viewcolor" action="default">#8C6BB1</property>
+    </view>
+   </item>"""
+
+
+def layout_description(with_mri: bool) -> str:
+    """The live layout in Slicer's XML; without an MRI there is no view for it."""
+    depth = _DEPTH_VIEW.format(mri=MRI) if with_mri else ""
+    return _VIEWS.format(microscope=MICROSCOPE, overview=OVERVIEW, through=THROUGH, depth=depth)
 
 
 class LiveViews:
     """The views of the live layout. through_view: gives view node, camera node and size (px) of the view through the
-    camera, or None while there is none; depth_node: the MRI's slice, or None."""
+    camera, or None while there is none; depth_node: gives the MRI's slice, or None. line_view_ids: of the views that
+    outlines are drawn in; () for all."""
 
-    def __init__(self, slice_node, composite_node, through_view: Callable[[], tuple | None], depth_node=None):
+    def __init__(
+        self,
+        slice_node,
+        composite_node,
+        through_view: Callable[[], tuple | None],
+        depth_node: Callable[[], object | None] = lambda: None,
+        line_view_ids: tuple[str, ...] = (),
+    ):
         self._slice, self._composite = slice_node, composite_node
-        self._through_view, self._depth = through_view, depth_node
+        self._through_view, self._depth_node = through_view, depth_node
+        self._line_view_ids = line_view_ids
         self._fitted: tuple | None = None
+        self._depth_fitted = None
 
     def follow(self, live: LiveScene, changed: bool) -> None:
         """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
@@ -67,14 +84,17 @@ class LiveViews:
             self._fitted = (size, live.camera)
             fit_slice(self._slice, live.camera, live.plane_mm)
         live.set_view_pixel(view_pixel_mm(self._slice))
+        live.show_lines_in(self._line_view_ids)
         show_layers(self._composite, live.frame, live.fill, live.fill_opacity)
         visible = live.overlay_visible
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
-        if self._depth is not None and visible:
-            align_depth_slice(self._depth, camera_to_world, live.plane_mm)
-            if changed:
-                fit_slice(self._depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
+        depth = self._depth_node() if visible else None
+        if depth is not None:
+            align_depth_slice(depth, camera_to_world, live.plane_mm)
+            if changed or self._depth_fitted is not depth:
+                self._depth_fitted = depth
+                fit_slice(depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
         through = self._through_view()
         if through is not None:
             view_node, camera_node, view_size_px = through
@@ -91,14 +111,15 @@ class LiveViews:
             put(None)
 
 
-def add_layout(layout_node) -> int:
+def add_layout(layout_node, with_mri: bool = True) -> int:
     """Make the layout known to Slicer once; returns its id."""
+    description = layout_description(with_mri)
     layout_id = FIRST_LAYOUT_ID
     while layout_node.IsLayoutDescription(layout_id):
-        if layout_node.GetLayoutDescription(layout_id).strip() == LAYOUT.strip():
+        if layout_node.GetLayoutDescription(layout_id).strip() == description.strip():
             return layout_id
         layout_id += 1
-    layout_node.AddLayoutDescription(layout_id, LAYOUT)
+    layout_node.AddLayoutDescription(layout_id, description)
     return layout_id
 
 

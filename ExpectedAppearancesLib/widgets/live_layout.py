@@ -17,6 +17,8 @@ class LayoutSection:
         self.views: live_views.LiveViews | None = None
         self._before: int | None = None
         self._banners: list = []
+        self._with_mri = False
+        self._overview_fits = False
 
     @property
     def active(self) -> bool:
@@ -28,21 +30,26 @@ class LayoutSection:
         if manager is None:
             return None
         layout_node = manager.layoutLogic().GetLayoutNode()
-        layout_id = live_views.add_layout(layout_node)
-        if layout_node.GetViewArrangement() != layout_id:
+        if layout_node.GetViewArrangement() not in self._layout_ids(layout_node):
             self._before = layout_node.GetViewArrangement()
-            layout_node.SetViewArrangement(layout_id)
         elif self._before is None:
             self._before = slicer.vtkMRMLLayoutNode.SlicerLayoutConventionalView
+        layout_node.SetViewArrangement(live_views.add_layout(layout_node, self._with_mri))
         widget = manager.sliceWidget(live_views.MICROSCOPE)
-        depth = manager.sliceWidget(live_views.MRI)
-        if widget is None or depth is None:
+        overview, through = self._three_d(live_views.OVERVIEW), self._three_d(live_views.THROUGH)
+        if widget is None or overview is None or through is None:
             return None
         composite = widget.sliceLogic().GetSliceCompositeNode()
-        self.views = live_views.LiveViews(widget.mrmlSliceNode(), composite, self._through, depth.mrmlSliceNode())
-        self._restrict_slice(widget.mrmlSliceNode(), manager)
+        shown_in = [view.mrmlViewNode() for view in (overview, through)]
+        for node in shown_in:  # nothing but the patient and the picture
+            node.SetBoxVisible(False)
+            node.SetAxisLabelsVisible(False)
+        ids = tuple(node.GetID() for node in (widget.mrmlSliceNode(), *shown_in))
+        self.views = live_views.LiveViews(widget.mrmlSliceNode(), composite, self._through, self._depth, ids)
+        self._overview_fits = False
+        self._restrict_slice(widget.mrmlSliceNode())
         if not self._banners:
-            for view in (widget.sliceView(), self._three_d(live_views.THROUGH).threeDView()):
+            for view in (widget.sliceView(), through.threeDView()):
                 renderer = view.renderWindow().GetRenderers().GetFirstRenderer()
                 self._banners.append((view, Banner(renderer)))
         return self.views
@@ -58,7 +65,7 @@ class LayoutSection:
         self.views = None
         if manager is not None and self._before is not None:
             layout_node = manager.layoutLogic().GetLayoutNode()
-            if layout_node.GetViewArrangement() == live_views.add_layout(layout_node):
+            if layout_node.GetViewArrangement() in self._layout_ids(layout_node):
                 layout_node.SetViewArrangement(self._before)
         self._before = None
 
@@ -68,11 +75,23 @@ class LayoutSection:
         for view, banner in self._banners:
             if banner.say(text, rgb):
                 view.scheduleRender()
+        if self.views is not None and not self._overview_fits and status.new and status.verdict.shows_overlay:
+            self._overview_fits = True
+            view = self._three_d(live_views.OVERVIEW).threeDView()
+            view.resetFocalPoint()
+            view.resetCamera()
 
     def show_mri(self, volume) -> None:
-        """Put a volume into the depth view, and that view into 3D."""
+        """Put a volume into the depth view, and that view into 3D; without a volume there is no such view."""
         manager = slicer.app.layoutManager()
-        widget = manager.sliceWidget(live_views.MRI) if manager is not None else None
+        if manager is None:
+            return
+        self._with_mri = volume is not None
+        layout_node = manager.layoutLogic().GetLayoutNode()
+        wanted = live_views.add_layout(layout_node, self._with_mri)
+        if layout_node.GetViewArrangement() in self._layout_ids(layout_node) - {wanted}:
+            layout_node.SetViewArrangement(wanted)
+        widget = manager.sliceWidget(live_views.MRI)
         if widget is None:
             return
         composite = widget.sliceLogic().GetSliceCompositeNode()
@@ -80,7 +99,16 @@ class LayoutSection:
         composite.SetForegroundVolumeID(None)
         composite.SetLabelVolumeID(None)
         widget.mrmlSliceNode().SetSliceVisible(volume is not None)
-        self._restrict_slice(widget.mrmlSliceNode(), manager)
+        self._restrict_slice(widget.mrmlSliceNode())
+
+    @staticmethod
+    def _layout_ids(layout_node) -> set[int]:
+        return {live_views.add_layout(layout_node, with_mri) for with_mri in (False, True)}
+
+    def _depth(self):
+        """The MRI's slice, or None without an MRI."""
+        widget = slicer.app.layoutManager().sliceWidget(live_views.MRI) if self._with_mri else None
+        return None if widget is None else widget.mrmlSliceNode()
 
     def _through(self) -> tuple | None:
         """View node, camera node and size of the view through the camera."""
@@ -92,7 +120,7 @@ class LayoutSection:
         size = tuple(widget.threeDView().renderWindow().GetSize())
         return None if camera_node is None else (node, camera_node, size)
 
-    def _restrict_slice(self, slice_node, manager) -> None:
+    def _restrict_slice(self, slice_node) -> None:
         """Draw a slice in the overview only: in the view through the camera the frame would hide the vessels."""
         overview = self._three_d(live_views.OVERVIEW)
         if overview is not None and not slice_node.GetNumberOfThreeDViewIDs():

@@ -13,6 +13,7 @@ from ..geometry.camera import Camera
 from ..live.trust import controls
 from ..mrml.live_controller import IDLE, LiveController
 from ..mrml.live_scene import OverlayOptions
+from ..mrml.mri import scan_to_show
 from . import live_install
 from .labels import set_text
 from .live_align import AlignSection
@@ -32,6 +33,7 @@ class LivePanel:
 
     def __init__(self, ui, controller: LiveController):
         self.ui, self.controller = ui, controller
+        controller.drawing_held = slicer.util.RenderBlocker
         self._parameter_node = None
         self._gui_tag = None
         self._message = ""
@@ -132,6 +134,8 @@ class LivePanel:
 
     def show_views(self) -> None:
         if slicer.app.layoutManager() is not None:
+            if self._parameter_node is not None:
+                self.layout.show_mri(self._parameter_node.mriVolume)
             self.controller.views = self.layout.enter()
 
     def fit(self) -> None:
@@ -155,9 +159,21 @@ class LivePanel:
         finally:
             qt.QApplication.restoreOverrideCursor()
         self._parameter_node.browser = None
+        self._show_scan()
         self.refresh()
         self.tick()
         return True
+
+    def _show_scan(self) -> None:
+        """The MRI that the case was planned on, unless another one is chosen."""
+        p = self._parameter_node
+        try:
+            scan = scan_to_show(slicer.mrmlScene, self.controller.case, p.mriVolume)
+        except ExpectedAppearancesError as error:  # registration does without
+            self.say(str(error))
+            return
+        if scan is not p.mriVolume:
+            p.mriVolume = scan
 
     def stop(self) -> None:
         self.controller.stop()

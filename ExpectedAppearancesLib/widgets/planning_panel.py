@@ -20,7 +20,7 @@ from .planning_appearances import AppearancesSection
 from .planning_case import CaseSection, MicroscopeSection
 from .planning_help import HelpSection
 from .planning_poses import PosesSection
-from .planning_qt import quiet, single_shot
+from .planning_qt import Stepper, quiet, single_shot
 from .planning_run import RunWatch
 from .planning_textures import TexturesSection
 from .planning_training import TrainingSection
@@ -36,7 +36,7 @@ SECTIONS = (
     TrainingSection,
     ValidationSection,
 )
-SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training"}
+SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training", "study": "validation"}
 
 
 class PlanningPanel:
@@ -50,7 +50,8 @@ class PlanningPanel:
         self.recorded = Recorded()
         self._followed: str | None = None
         self._next = ""
-        self._timer = single_shot(REFRESH_MS, self.refresh)
+        self._timer = single_shot(REFRESH_MS, self._refresh_in_pieces)
+        self._stepper = Stepper()
         self._ending: list = []  # runs of a closed scene that are being ended
         self._ending_timer = qt.QTimer()
         self._ending_timer.setInterval(500)
@@ -64,6 +65,7 @@ class PlanningPanel:
         self.parameters = parameters
         if parameters is None:
             self._timer.stop()
+            self._stepper.stop()
             return
         self.loading = True
         try:
@@ -89,6 +91,7 @@ class PlanningPanel:
         """The widget is destroyed: runs go on and are found again by the next panel."""
         self.exit()
         self._timer.stop()
+        self._stepper.stop()
         self._ending_timer.stop()
         for watch in self.runs.values():
             watch.forget()
@@ -102,8 +105,9 @@ class PlanningPanel:
             self._timer.start()
 
     def refresh(self) -> None:
-        """Work out the steps and show them. Everything in here is cheap, or kept from the last time."""
+        """Work out the steps and show them, at once. `refresh_soon` does it between the events of the GUI."""
         self._timer.stop()
+        self._stepper.stop()
         if self.parameters is None:
             return
         if self._followed != self.parameters.casePath:
@@ -112,13 +116,25 @@ class PlanningPanel:
                 watch.follow(self._followed)
         if not self.entered:
             return
-        self.steps = self.session.steps(self.parameters, self.running())
+        self.session.busy = self.busy()
         self.recorded = self.session.recorded(self.parameters)
+        self.steps = self.session.steps(self.parameters, self.running(), self.recorded)
         for section in self.sections.values():
             section.refresh()
             section.show_step()
         self.help.refresh()
         self._show_next()
+
+    def _refresh_in_pieces(self) -> None:
+        """What is large is looked at piece by piece, so that no call takes long."""
+
+        def pieces():
+            if self.entered:
+                self.session.busy = self.busy()
+                yield from self.session.prepare(self.parameters)
+            self.refresh()
+
+        self._stepper.start(pieces())
 
     def running(self) -> frozenset[str]:
         return frozenset(kind for kind, watch in self.runs.items() if watch.active)
@@ -138,6 +154,8 @@ class PlanningPanel:
                         slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
                     elif slicer.app.layoutManager():
                         slicer.util.resetThreeDViews()
+                        if self.parameters.mriVolume:
+                            slicer.util.setSliceViewerLayers(background=self.parameters.mriVolume, fit=True)
             finally:
                 self.loading = False
         self.refresh()
@@ -189,6 +207,8 @@ class PlanningPanel:
         if status.state is RunState.DONE and self.entered:
             self.refresh()
             self._go_on_from(SECTION_OF_KIND[kind])
+            if kind == "study":
+                self.sections["validation"].on_show()
         self.refresh_soon()
 
     def _show_next(self) -> None:

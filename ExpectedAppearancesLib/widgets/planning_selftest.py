@@ -62,6 +62,27 @@ def test_case_is_saved_in_world_coordinates(test) -> None:
         test.assertIn("vessel model", panel.steps["case"].text)
 
 
+def test_scan_is_saved_with_the_case_and_found_again(test) -> None:
+    with _Folder() as folder:
+        panel, _node = _with_models(folder)
+        case = _saved(test, panel, folder)
+        scan = slicer.util.addVolumeFromArray(np.arange(24000, dtype=np.int16).reshape(20, 30, 40), name="T1")
+        panel.ui.mriSelector.setCurrentNode(scan)
+        _wait(test, lambda: "without the MRI" in panel.steps["case"].text)
+        test.assertTrue(panel.ui.saveCaseButton.enabled)
+        panel.ui.saveCaseButton.click()
+        _wait(test, lambda: panel.steps["case"].text == "Saved.")
+        test.assertTrue((case.folder / "mri.nrrd").is_file())
+        slicer.mrmlScene.Clear()
+        panel.open_folder(str(folder / "case"), take_over=True)
+        shown = panel.parameters.mriVolume
+        test.assertEqual(shown.GetName(), "T1")
+        np.testing.assert_array_equal(slicer.util.arrayFromVolume(shown).shape, (20, 30, 40))
+        test.assertEqual(panel.steps["case"].text, "Saved.")
+        slicer.mrmlScene.Clear()
+        test.assertIsNone(panel.parameters.mriVolume)
+
+
 def test_microscope_from_file_or_view(test) -> None:
     panel = _panel()
     p = panel.parameters
@@ -265,10 +286,28 @@ def test_from_models_to_a_trained_model(test) -> None:
         test.assertTrue(panel.ui.showFiguresButton.enabled)
         test.assertTrue(panel.ui.verdictLabel.text)
         test.assertIsNotNone(charts.chart_of(slicer.mrmlScene, "training.chart"))
+        _start_and_cancel_a_study(test, panel)
         p.poseCount = 5
         panel.refresh()
         test.assertEqual(panel.steps["poses"].state, StepState.STALE)
         test.assertEqual(panel.steps["training"].state, StepState.STALE)
+
+
+def _start_and_cancel_a_study(test, panel) -> None:
+    """It trains a model for each texture, which is too long for a test; what it says of itself is looked at."""
+    ui = panel.ui
+    test.assertEqual(ui.studyStart.text, "Start the study")
+    test.assertIn("4 models", ui.studyHint.text)
+    test.assertTrue(ui.studyStart.enabled, ui.studyStart.toolTip)
+    ui.studyStart.click()
+    _wait(test, lambda: "models are to be trained" in ui.studyLine.text or "quick-strict" in ui.studyLine.text, 300)
+    test.assertEqual(panel.steps["validation"].state, StepState.RUNNING)
+    for button in (ui.renderButton, ui.appearancesStart, ui.trainingStart):
+        test.assertIn("A study is going on", button.toolTip)
+        test.assertFalse(button.enabled)
+    ui.studyCancel.click()
+    _wait(test, lambda: not panel.runs["study"].active, 120)
+    _wait(test, lambda: ui.studyStart.text == "Continue the study")
 
 
 TESTS = [value for name, value in list(globals().items()) if name.startswith("test_")]

@@ -32,8 +32,8 @@ ADD_LIMIT_MM = 1.0
 
 @dataclass
 class Measured:
-    """ms, one number for each frame but the first two of a session; gui_calls_ms and gui_calls_cpu_ms: one for each call
-    on the GUI's thread that a frame makes, those of the first frames too: taking it into the scene, and drawing."""
+    """ms, one number for each frame but the first two of a session; gui_calls_ms and gui_calls_cpu_ms: one for each
+    call on the GUI's thread that a frame makes, those of the first frames too: taking it in, and drawing."""
 
     update_ms: list = field(default_factory=list)
     worker_cpu_ms: list = field(default_factory=list)
