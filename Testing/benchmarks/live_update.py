@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,7 @@ class Measured:
 
 
 def measure(inputs_folder: Path | None = None) -> dict:
-    """live_update: {median_ms, ratio, ...}. inputs_folder: vessels.vtp and cortex.vtp; without it, generated ones."""
+    """live_update: {median_ms, ratio, ...}, see Measured. inputs_folder: vessels.vtp and cortex.vtp; without it, generated ones."""
     sys.path.insert(0, str(TESTING))
     from mrml_views import SliceView, new_application
 
@@ -53,7 +53,7 @@ def measure(inputs_folder: Path | None = None) -> dict:
     from ExpectedAppearancesLib.mrml.live_views import LiveViews
 
     with tempfile.TemporaryDirectory() as folder:
-        phantom = _case(Path(folder), inputs_folder)
+        phantom = phantom_case(Path(folder), inputs_folder)
         poses = [phantom.pose(i / FRAMES) for i in range(FRAMES)]
         with PhantomPainter(phantom) as painter:
             frames = [painter.paint(pose) for pose in poses]
@@ -66,7 +66,7 @@ def measure(inputs_folder: Path | None = None) -> dict:
             _run_live(controller, view, phantom, poses, frames, measured)
             _run_plain(scene, view, phantom, poses[:REFERENCE_FRAMES], frames, plain_ms)
         controller.close()
-    return {
+    result = {
         "median_ms": _ms(np.median(measured.update_ms)),
         "p95_ms": _ms(np.percentile(measured.update_ms, 95)),
         "worker_cpu_median_ms": _ms(np.median(measured.worker_cpu_ms)),
@@ -80,13 +80,15 @@ def measure(inputs_folder: Path | None = None) -> dict:
         "frame_px": list(FRAME),
         "view_px": list(VIEW),
     }
+    return {"live_update": result}
 
 
 def _ms(value) -> float:
     return round(float(value), 1)
 
 
-def _case(folder: Path, inputs_folder: Path | None):
+def phantom_case(folder: Path, inputs_folder: Path | None, size_px: int = 128):
+    """The phantom of a case whose frames are FRAME, with a network of that input size at the quick preset's cost."""
     from ExpectedAppearancesLib.case.case import Case
     from ExpectedAppearancesLib.case.meshes import write_vtp
     from ExpectedAppearancesLib.demo.phantom import as_phantom
@@ -102,11 +104,12 @@ def _case(folder: Path, inputs_folder: Path | None):
     case = Case.create(folder / "case", *paths, camera)
     phantom = as_phantom(case)
     # In a process of its own: VTK and torch's exporter do not go together.
-    subprocess.run([sys.executable, __file__, "--write-network", str(case.model_folder)], check=True)
+    command = [sys.executable, __file__, "--write-network", str(case.model_folder), "--size", str(size_px)]
+    subprocess.run(command, check=True)
     return phantom
 
 
-def write_network(folder: Path) -> None:
+def write_network(folder: Path, size_px: int) -> None:
     """The quick preset's network, untrained, plus the phantom's operations: the phantom's output at the real cost.
 
     It replaces the phantom's in `folder`, a case's model folder.
@@ -132,9 +135,9 @@ def write_network(folder: Path) -> None:
             read = torch.cat([coordinates, sigma, surface, torch.zeros_like(surface) - 1], dim=1)
             return read + 1e-12 * self.network(image)[:, :6]
 
-    meta = files.read_json(folder / META_NAME, "model")
+    meta = files.read_json(folder / META_NAME, "model") | {"size_px": size_px}
     del meta["format_version"], meta["model_sha256"]
-    export_model(Both(), PRESETS["quick"], meta, folder)
+    export_model(Both(), replace(PRESETS["quick"], size_px=size_px), meta, folder)
 
 
 def _run_live(controller, view, phantom, poses, frames, measured: Measured) -> None:
@@ -225,11 +228,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=Path, metavar="DIR", help="vessels.vtp and cortex.vtp; else generated")
     parser.add_argument("--write-network", type=Path, metavar="DIR", help=argparse.SUPPRESS)
+    parser.add_argument("--size", type=int, default=128, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.write_network:
-        write_network(args.write_network)
+        write_network(args.write_network, args.size)
         return
-    print(json.dumps({"live_update": measure(args.inputs)}, indent=1))
+    print(json.dumps(measure(args.inputs), indent=1))
 
 
 if __name__ == "__main__":
