@@ -44,7 +44,7 @@ class Measured:
 
 
 def measure(inputs_folder: Path | None = None) -> dict:
-    """live_update: {median_ms, ratio, ...}, see Measured. inputs_folder: vessels.vtp and cortex.vtp; without it, generated ones."""
+    """live_update: {median_ms, ratio, ...}, see Measured. inputs_folder: of vessels.vtp, cortex.vtp; else generated."""
     sys.path.insert(0, str(TESTING))
     from mrml_views import SliceView, new_application
 
