@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ExpectedAppearancesLib import files
-from ExpectedAppearancesLib.demo.phantom import covered_frame, make_phantom
+from ExpectedAppearancesLib.demo.phantom import PhantomPainter, covered_frame, make_phantom
 from ExpectedAppearancesLib.live.trust import Sight
 from ExpectedAppearancesLib.registration.poses_file import read_poses
 
@@ -155,4 +155,46 @@ def test_recording_ends_at_its_limit(application, phantom, model, frames):
         wait_for(controller, lambda s: s.new)
     assert controller.recorder.full and controller.recorder.frames == 3
     assert controller.stop_recording().GetNumberOfItems() == 3
+    controller.close()
+
+
+def test_a_steadied_session_draws_and_records_the_filtered_pose(application, phantom, model, tmp_path):
+    scene, _logic = application
+    poses = [phantom.pose(0.1 + 0.001 * i) for i in range(8)]
+    with PhantomPainter(phantom, SMALL) as painter:
+        images = [painter.paint(pose) for pose in poses]
+    images.insert(6, covered_frame(1, SMALL))
+    now = [0.0]
+    stream = node_with(scene, images[0])
+    controller = LiveController(scene, clock=lambda: now[0])
+    controller.start(choice_of(phantom, stale_s=60, steady=True), model=model)
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.VIEW_LOST  # one frame is no motion yet
+    controller.start_recording()
+    drawn = []
+    for image in images:
+        now[0] += 0.1
+        send(stream, image)
+        status = wait_for(controller, lambda s: s.new)
+        result, live = status.result, controller.live
+        assert live.overlay_visible == status.verdict.shows_overlay == result.steadied.tracked.used
+        if live.overlay_visible:
+            expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(result.camera_from_world)
+            np.testing.assert_allclose(camera_to_ras_of(live.transform), expected, atol=1e-6)
+            assert not np.allclose(result.camera_from_world, result.prediction.camera_from_world, atol=1e-6)
+        drawn.append((live.overlay_visible, result.camera_from_world, result.prediction.camera_from_world))
+    assert [visible for visible, _filtered, _own in drawn] == [False, True, True, True, True, True, False, True, True]
+    controller.stop()
+    (browser,) = live_record.recordings(scene)
+    for item, (visible, filtered, _own) in enumerate(drawn):
+        browser.SetSelectedItemNumber(item)
+        status = controller.replay(browser)
+        assert status.verdict.shows_overlay == visible == controller.live.overlay_visible
+        if visible:
+            expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(filtered)
+            np.testing.assert_allclose(camera_to_ras_of(controller.live.transform), expected, atol=1e-6)
+    _camera, exported = read_poses(live_record.export(browser, tmp_path / "out", phantom.case.space))
+    for entry, (visible, _filtered, own) in zip(exported, drawn):
+        assert entry.extra["tracking"]["used"] == visible
+        if visible:
+            np.testing.assert_allclose(entry.camera_from_world, own, atol=1e-12)
     controller.close()

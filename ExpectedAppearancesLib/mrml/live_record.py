@@ -6,6 +6,7 @@ All is saved with the scene by Slicer itself. Replaying puts a frame, its transf
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +128,7 @@ def recorded_frames(browser, pixels: bool = True) -> Iterator[tuple[RecordedFram
         image = None
         if pixels:
             image = pixels_of(sequences[FRAME].GetNthDataNode(item).GetImageData())
-        yield RecordedFrame(frame.time_s, frame.name, frame.camera, frame.prediction, image), key
+        yield replace(frame, image_rgb=image), key
 
 
 def frame_at(browser) -> tuple[RecordedFrame, str]:
