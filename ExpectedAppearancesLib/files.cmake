@@ -120,6 +120,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/poses/sampling.py
   ExpectedAppearancesLib/registration/__init__.py
   ExpectedAppearancesLib/registration/confidence.py
+  ExpectedAppearancesLib/registration/contrast.py
   ExpectedAppearancesLib/registration/covariance.py
   ExpectedAppearancesLib/registration/decoding.py
   ExpectedAppearancesLib/registration/footage.py

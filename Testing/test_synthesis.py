@@ -291,15 +291,15 @@ def test_targets_are_made_once_for_a_texture_and_only_few_are_kept(vgg, monkeypa
     calls = []
     original = texture_grams
     monkeypatch.setattr(
-        "ExpectedAppearancesLib.appearances.synthesis.texture_grams", lambda *a: calls.append(1) or original(*a)
+        "ExpectedAppearancesLib.appearances.gram.texture_grams", lambda *a: calls.append(1) or original(*a)
     )
     synthesizer = Synthesizer(vgg, CPU, 1)
     for seed in range(3):
         synthesizer.run([Job(label_map(), texture("a"), seed)])
     assert len(calls) == 1
     for i in range(20):
-        synthesizer._target(texture(f"t{i}"), 32, 32)
-    assert len(synthesizer._targets) <= 8
+        synthesizer.targets.of(texture(f"t{i}"), 32, 32)
+    assert len(synthesizer.targets._kept) <= 4
 
 
 def test_operations_are_those_of_the_layers():

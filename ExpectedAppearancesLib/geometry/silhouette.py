@@ -14,6 +14,7 @@ class Silhouette:
 
     def __init__(self, vertices_mm: np.ndarray, triangles: np.ndarray):
         self._vertices_mm = np.asarray(vertices_mm, float)
+        self._triangles = np.asarray(triangles)
         a, b, c = (self._vertices_mm[triangles[:, i]] for i in range(3))
         self._middle_mm = self._vertices_mm.mean(axis=0) if len(self._vertices_mm) else np.zeros(3)
         self._face_normals = np.cross(b - a, c - a)
@@ -32,12 +33,33 @@ class Silhouette:
 
         facing_borders_only: leave out border edges of triangles that turn their back, which mostly hide behind others.
         """
+        return self._edges[self._is_outline(self._facing(camera_from_world), facing_borders_only)]
+
+    def edges_with_inside(self, camera_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `edges` with facing borders only, and for each edge (E,) the third vertex of a triangle at it that faces
+        the camera: the side on which the surface is seen."""
+        facing = self._facing(camera_from_world)
+        chosen = self._is_outline(facing, facing_borders_only=True)
+        if not chosen.any():
+            return self._edges[chosen], np.zeros(0, int)
+        side = np.arange(len(self._triangles_at))
+        seen = np.where(self._towards_at(camera_from_world), side, len(side))
+        triangle = self._triangles_at[np.minimum.reduceat(seen, self._first_at)[chosen]]
+        edges = self._edges[chosen]
+        return edges, self._triangles[triangle].sum(axis=1) - edges.sum(axis=1)
+
+    def _facing(self, camera_from_world: np.ndarray) -> np.ndarray:
+        """Number of triangles at each edge that face the camera."""
         if not len(self._edges):
-            return self._edges
-        towards = self.towards(camera_from_world)
-        facing = np.add.reduceat(towards[self._triangles_at].astype(np.int32), self._first_at)
+            return np.zeros(0, np.int32)
+        return np.add.reduceat(self._towards_at(camera_from_world).astype(np.int32), self._first_at)
+
+    def _towards_at(self, camera_from_world: np.ndarray) -> np.ndarray:
+        return self.towards(camera_from_world)[self._triangles_at]
+
+    def _is_outline(self, facing: np.ndarray, facing_borders_only: bool) -> np.ndarray:
         border = (self._sides == 1) & (facing >= (1 if facing_borders_only else 0))
-        return self._edges[border | ((facing > 0) & (facing < self._sides))]
+        return border | ((facing > 0) & (facing < self._sides))
 
     def towards(self, camera_from_world: np.ndarray) -> np.ndarray:
         """bool (F,): whether each triangle faces the camera."""
