@@ -169,3 +169,14 @@ def test_the_panel_loads_without_what_it_offers_to_install():
     root = str(Path(__file__).resolve().parents[1])
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_device_is_said_that_the_model_runs_on_in_fact(phantom, monkeypatch):
+    from ExpectedAppearancesLib.live.estimator import PROVIDER_NAMES, open_model
+    from ExpectedAppearancesLib.registration.predictor import Predictor
+
+    opened = open_model(phantom.case)
+    assert opened.device == PROVIDER_NAMES[opened.estimator._session.get_providers()[0]]
+    for provider, device in (("CUDAExecutionProvider", "GPU (CUDA)"), ("CPUExecutionProvider", "CPU")):
+        monkeypatch.setattr(Predictor, "provider", provider)
+        assert open_model(phantom.case).device == device

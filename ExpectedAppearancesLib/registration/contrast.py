@@ -137,9 +137,10 @@ class _Profile:
         outside = cv2.remap(dark, where, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
         self.on_tissue = ~(outside > 0).any(axis=1)
         # Differences across the outline, so that light which changes from place to place does not count.
-        across = (colours[:, INSIDE].mean(axis=1) - colours[:, BEYOND].mean(axis=1))[self.on_tissue]
+        across = (colours[:, INSIDE].mean(axis=1) - colours[:, BEYOND].mean(axis=1))[self.on_tissue].astype(float)
         mean = across.mean(axis=0) if len(across) else np.zeros(3)
-        spread = np.cov(across.T) + 4 * np.eye(3) if len(across) > 3 else np.eye(3)
+        apart = across - mean
+        spread = apart.T @ apart / (len(across) - 1) + 4 * np.eye(3) if len(across) > 3 else np.eye(3)
         axis = np.linalg.solve(spread, mean)
         self._values = colours @ axis
         self._expected = max(float(mean @ axis), 1e-9)
