@@ -172,6 +172,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/widgets/planning_run.py
   ExpectedAppearancesLib/widgets/planning_section.py
   ExpectedAppearancesLib/widgets/planning_selftest.py
+  ExpectedAppearancesLib/widgets/planning_selftest_tools.py
   ExpectedAppearancesLib/widgets/planning_textures.py
   ExpectedAppearancesLib/widgets/planning_training.py
   ExpectedAppearancesLib/widgets/planning_validation.py

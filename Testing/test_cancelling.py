@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import platform
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +16,14 @@ from ExpectedAppearancesLib.cancelling import cancelling_waits
 from ExpectedAppearancesLib.cli import main, termination_cancels
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.runs.environment import library_environment
-from ExpectedAppearancesLib.runs.record import exclusive, runs_folder
+from ExpectedAppearancesLib.runs.record import (
+    LOOK_EVERY_S,
+    RunRecord,
+    exclusive,
+    obey_record,
+    runs_folder,
+    write_record,
+)
 
 HOLD = """
 import sys, time
@@ -53,6 +62,20 @@ def test_what_fails_before_the_signal_is_carried_out_is_told():
     with termination_cancels(), pytest.raises(ValueError, match="first"), cancelling_waits():
         signal.raise_signal(signal.SIGTERM)
         raise ValueError("first")
+
+
+def test_a_run_obeys_its_record_where_no_signal_reaches_it(tmp_path):
+    """As on Windows; the record of another run is none of its business."""
+    written = RunRecord("train", 1, 0.0, "mine", platform.node(), "", [], "", "x.log")
+    write_record(tmp_path, written)
+    with termination_cancels(), pytest.raises(CancelledError), cancelling_waits() as stop:
+        thread = obey_record(tmp_path, "train", "mine")
+        write_record(tmp_path, replace(written, mark="other", cancelled=True))
+        thread.join(3 * LOOK_EVERY_S)
+        assert thread.is_alive() and not stop.asked
+        write_record(tmp_path, replace(written, cancelled=True))
+        thread.join(60)
+        assert stop.asked and not thread.is_alive()
 
 
 @pytest.fixture

@@ -165,6 +165,8 @@ def test_what_is_missing_or_damaged_is_told(scene, planned, case):
         mri.scan_of(scene, case)
     assert scene.GetNumberOfNodes() == count
     assert adopt(session, p, scene) is not None and p.mriVolume is None  # the case can be worked on all the same
+    p.mriVolume = volume(scene)
+    assert session.scan_to_keep(p) is not None  # chosen again, it is kept again
 
 
 def test_the_live_panel_shows_the_scan_of_its_case(scene, case):

@@ -256,3 +256,31 @@ def test_the_session_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+LOOK_AROUND = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import cases, numpy as np
+from ExpectedAppearancesLib.masks.renderer import MaskRenderer
+from ExpectedAppearancesLib.mrml import planning
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
+from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
+vessels, cortex, camera = cases.vessels(), cases.dome(), cases.camera()
+sampler = PoseSampler(find_craniotomy(vessels, cortex), PoseRanges(), camera, vessels.vertices_mm, 0)
+poses = np.stack([sampler.sample(i) for i in range(3)])
+planning.frustum_polydata(camera, poses, np.ones(3), "LPS")
+with MaskRenderer(vessels, cortex, camera) as renderer:
+    assert renderer.render(poses[0]).any()
+print([m for m in ("torch", "cv2", "onnxruntime", "skimage", "scipy") if m in sys.modules])
+"""
+
+
+def test_drawing_cameras_and_label_maps_loads_nothing_heavy():
+    """OpenCV takes a quarter of a second of the GUI's thread, seconds on a busy computer."""
+    import subprocess
+    from pathlib import Path
+
+    command = [sys.executable, "-c", LOOK_AROUND, str(Path(__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr

@@ -56,8 +56,8 @@ def placement(node) -> list[float]:
 
 
 def is_scan_of(case: Case, identity: dict) -> bool:
-    """Whether a volume of this identity is the case's scan, as it was chosen or as it is kept."""
-    return any(_same(identity, known) for known in _entry(case).get("identities", []))
+    """Whether a volume of this identity is the scan that the case keeps, as it was chosen or as its file has it."""
+    return _is_known(case, identity) and (case.folder / _entry(case)["file"]).is_file()
 
 
 def keep_scan(case: Case, node, identity: dict | None = None) -> Path:
@@ -98,7 +98,7 @@ def scan_of(scene, case: Case):
     for i in range(scene.GetNumberOfNodesByClass("vtkMRMLScalarVolumeNode")):
         node = scene.GetNthNodeByClass(i, "vtkMRMLScalarVolumeNode")
         # Volumes that were never a case's are not looked into: there may be many.
-        if node.GetAttribute(ATTRIBUTE) in digests and is_scan_of(case, scan_identity(node)):
+        if node.GetAttribute(ATTRIBUTE) in digests and _is_known(case, scan_identity(node)):
             return node
     path = case.folder / entry["file"]
     if not path.is_file():
@@ -127,6 +127,10 @@ def scan_to_show(scene, case: Case, chosen):
 def _entry(case: Case) -> dict:
     entry = case.manifest.get("attachments", {}).get(MRI)
     return entry if isinstance(entry, dict) and {"file", "identities"} <= entry.keys() else {}
+
+
+def _is_known(case: Case, identity: dict) -> bool:
+    return any(_same(identity, known) for known in _entry(case).get("identities", []))
 
 
 def _same(first: dict, second: dict) -> bool:

@@ -214,12 +214,14 @@ def look_at_mask(slice_node, camera: Camera, camera_from_world, plane_mm: float,
     # Slice views sample at the corners of their pixels: with this pixel at the origin the map stays sharp.
     origin = [camera.width / 2, camera.height / 2 - 1, 0, 1]
     plane_to_camera[:, 3] = camera_from_pixel(camera, plane_mm) @ origin
-    slice_node.GetSliceToRAS().DeepCopy(_vtk_matrix(camera_to_ras(camera_from_world, space) @ plane_to_camera))
-    slice_node.UpdateMatrices()
     width_mm, height_mm = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
     view_width, view_height = slice_node.GetDimensions()[:2]
     mm_per_px = max(width_mm / max(view_width, 1), height_mm / max(view_height, 1))
+    modifying = slice_node.StartModify()  # the view answers to each change, else
+    slice_node.GetSliceToRAS().DeepCopy(_vtk_matrix(camera_to_ras(camera_from_world, space) @ plane_to_camera))
+    slice_node.UpdateMatrices()
     slice_node.SetFieldOfView(mm_per_px * view_width, mm_per_px * view_height, slice_node.GetFieldOfView()[2])
+    slice_node.EndModify(modifying)
 
 
 def plane_through(centre_world_mm: np.ndarray, camera_from_world: np.ndarray) -> float:

@@ -23,6 +23,7 @@ from ..cli.progress import Progress, duration
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, CancelledError, InputError
 from .environment import MODULES
 from .output import EXIT_PREFIX, FIGURES_PREFIX
+from .processes import MARK_VARIABLE
 
 # A run of hours reports less and less often, so that its log stays small.
 LONGEST_INTERVAL_S = 5.0
@@ -160,6 +161,7 @@ def main(command: str, arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(command: str, arguments: list[str], progress: SlicerProgress) -> int:
+    from .record import obey_record
     from .results import result_problem
 
     case_folder = Path(arguments[0]).absolute() if arguments and not arguments[0].startswith("-") else None
@@ -167,6 +169,8 @@ def _run(command: str, arguments: list[str], progress: SlicerProgress) -> int:
         return cli.main([command, *arguments])  # explains itself, or says what is wrong with the case
     progress._case_folder = case_folder
     progress.start()
+    if os.name == "nt" and os.environ.get(MARK_VARIABLE):
+        obey_record(case_folder, command, os.environ[MARK_VARIABLE])
     code = cli.main([command, *arguments], progress)
     problem = result_problem(command, case_folder, thorough=True) if code == EXIT_DONE else ""
     if problem:

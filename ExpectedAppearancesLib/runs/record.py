@@ -7,6 +7,8 @@ import datetime
 import logging
 import os
 import platform
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
@@ -16,6 +18,7 @@ from .. import files
 from ..errors import InputError
 
 FORMAT = "ExpectedAppearances run"
+LOOK_EVERY_S = 0.5
 NAMED_WITHIN_S = 2.0  # a holder of a lock has written who it is
 # What goes on under a lock of this name, in the user's words.
 NAMES = {
@@ -81,6 +84,23 @@ def update_record(case_folder: Path, record: RunRecord, **changes) -> RunRecord:
         with contextlib.suppress(InputError):
             write_record(case_folder, changed)
     return changed
+
+
+def obey_record(case_folder: Path, kind: str, mark: str) -> threading.Thread:
+    """Raise SIGTERM in this process once the record of its run says that it is cancelled: for Windows, where no other
+    process can. Returns the thread that looks."""
+
+    def look() -> None:
+        while True:
+            record = read_record(case_folder, kind)
+            if record is not None and record.mark == mark and record.cancelled:
+                signal.raise_signal(signal.SIGTERM)  # its handler is called in the main thread
+                return
+            time.sleep(LOOK_EVERY_S)
+
+    thread = threading.Thread(target=look, name="cancelled?", daemon=True)
+    thread.start()
+    return thread
 
 
 @contextlib.contextmanager

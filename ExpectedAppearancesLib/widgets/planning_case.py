@@ -113,6 +113,11 @@ class CaseSection(Section):
         if node is not None and self.parameters is not None and not self.panel.loading:
             slicer.util.setSliceViewerLayers(background=node)
 
+    def show_scan(self) -> None:
+        """Show the MRI of a case that was opened."""
+        if self.parameters.mriVolume and slicer.app.layoutManager():
+            slicer.util.setSliceViewerLayers(background=self.parameters.mriVolume, fit=True)
+
     def on_new(self, folder: str = "") -> None:
         """Choose where the case will be; it is written when it is saved."""
         if not folder:

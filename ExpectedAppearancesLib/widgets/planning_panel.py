@@ -15,6 +15,7 @@ from ..case.steps import STEPS, Step, StepState, next_step
 from ..mrml.planning_adopt import adopt
 from ..mrml.planning_session import PlanningSession
 from ..runs.closing import OnClose, close_runs, going_on, question
+from ..runs.runner import loaded_for_runs
 from ..runs.state import RunState, RunStatus
 from .planning_appearances import AppearancesSection
 from .planning_case import CaseSection, MicroscopeSection
@@ -132,7 +133,8 @@ class PlanningPanel:
             if self.entered:
                 self.session.busy = self.busy()
                 yield from self.session.prepare(self.parameters)
-            self.refresh()
+                yield from loaded_for_runs()
+            self.refresh()  # the last: it stops what is still to be done
 
         self._stepper.start(pieces())
 
@@ -154,11 +156,11 @@ class PlanningPanel:
                         slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
                     elif slicer.app.layoutManager():
                         slicer.util.resetThreeDViews()
-                        if self.parameters.mriVolume:
-                            slicer.util.setSliceViewerLayers(background=self.parameters.mriVolume, fit=True)
             finally:
                 self.loading = False
         self.refresh()
+        if take_over:
+            self.sections["case"].show_scan()
         self.unfold(self._next)
 
     def unfold(self, name: str) -> None:
