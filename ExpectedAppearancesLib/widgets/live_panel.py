@@ -39,6 +39,7 @@ class LivePanel:
         self._problem = ""
         self._missing = live_install.problem()
         self._ticks = 0
+        self._buttons: tuple | None = None
         self._camera = None
         self.layout = LayoutSection()
         self.status = StatusSection(ui)
@@ -210,11 +211,12 @@ class LivePanel:
         ):
             if widget.enabled != enabled:
                 widget.enabled = enabled
-        set_text(ui.startButton, _("Stop") if running else _("Start"))
         if ui.freezeButton.checked != self.controller.frozen:
             ui.freezeButton.checked = self.controller.frozen
-        single = _("Next frame") if running and self.controller.frozen else _("Single frame")
-        set_text(ui.singleButton, single)
+        if self._buttons != (running, self.controller.frozen):
+            self._buttons = (running, self.controller.frozen)
+            set_text(ui.startButton, _("Stop") if running else _("Start"))
+            set_text(ui.singleButton, _("Next frame") if all(self._buttons) else _("Single frame"))
 
     def _remember_camera(self) -> None:
         """A of the frame on the screen, in the parameter node: a scene does not save a view's window centre."""

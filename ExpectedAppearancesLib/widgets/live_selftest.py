@@ -65,17 +65,25 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
 def scene_close_and_reload_in_mid_stream_leave_nothing(test) -> None:
     if not registration_is_installed(test):
         return
+    manager = slicer.app.layoutManager()
+    if manager:
+        slicer.util.selectModule("Data")
+        before = manager.layout
     with tempfile.TemporaryDirectory() as folder:
         _phantom, widget = started(Path(folder))
         next_result(test, widget)
         slicer.mrmlScene.Clear()
         test.assertFalse(widget.panel.controller.running)
         test.assertFalse(threads())
+        if manager:
+            slicer.util.selectModule("Data")
+            test.assertEqual(manager.layout, before)
         clean = slicer.mrmlScene.GetNumberOfNodes()
         _phantom, widget = started(Path(folder))
         next_result(test, widget)
         if slicer.app.layoutManager():
             slicer.util.reloadScriptedModule(MODULE)
+            test.assertTrue(slicer.util.getModuleWidget(MODULE).panel.layout.active)
         else:
             widget.cleanup()
         test.assertFalse(threads())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 from slicer.i18n import tr as _
@@ -18,10 +19,10 @@ COLOURS = dict.fromkeys(Sight, RED) | {
 }
 
 
-def headline(status: Status) -> str:
-    """A few words that can be read across the room; also drawn over the frame."""
-    verdict = status.verdict
-    texts = {
+# Translated once: asking for a translation takes longer than a tick may.
+@functools.cache
+def _headlines() -> dict[Sight, str]:
+    return {
         Sight.IDLE: _("NOT LIVE"),
         Sight.WAITING: _("WAITING FOR A PICTURE"),
         Sight.LOST: _("NO PICTURE: source lost"),
@@ -33,7 +34,25 @@ def headline(status: Status) -> str:
         Sight.FROZEN: _("FROZEN: not live"),
         Sight.FOLLOWING: _("FOLLOWING"),
     }
-    return texts[verdict.sight]
+
+
+@functools.cache
+def _details() -> dict[Sight, str]:
+    return {
+        Sight.IDLE: _("Choose a case and a source, then press Start."),
+        Sight.WAITING: _("Started; no frame has come yet."),
+        Sight.LOST: _("The source gives no frames; it is tried again every second."),
+        Sight.OTHER_CASE: _("These frames were registered to the vessels of another case. Open that case."),
+        Sight.STALE: _("No new frame has come in time. The picture on the screen is not the present."),
+        Sight.REFUSED: _("The vessels were not found with enough confidence. Clear the view, or focus again."),
+        Sight.FROZEN: _("The overlay belongs to this frame. Press Freeze again to go on."),
+        Sight.FOLLOWING: _("The overlay belongs to the newest frame. Not for clinical use."),
+    }
+
+
+def headline(status: Status) -> str:
+    """A few words that can be read across the room; also drawn over the frame."""
+    return _headlines()[status.verdict.sight]
 
 
 def detail(status: Status) -> str:
@@ -45,17 +64,7 @@ def detail(status: Status) -> str:
         return verdict.detail
     if verdict.sight is Sight.FROZEN and status.result is not None and status.result.image_rgb is None:
         return _("A recorded frame, with the pose that it had.")
-    texts = {
-        Sight.IDLE: _("Choose a case and a source, then press Start."),
-        Sight.WAITING: _("Started; no frame has come yet."),
-        Sight.LOST: _("The source gives no frames; it is tried again every second."),
-        Sight.OTHER_CASE: _("These frames were registered to the vessels of another case. Open that case."),
-        Sight.STALE: _("No new frame has come in time. The picture on the screen is not the present."),
-        Sight.REFUSED: _("The vessels were not found with enough confidence. Clear the view, or focus again."),
-        Sight.FROZEN: _("The overlay belongs to this frame. Press Freeze again to go on."),
-        Sight.FOLLOWING: _("The overlay belongs to the newest frame. Not for clinical use."),
-    }
-    return texts.get(verdict.sight, "")
+    return _details().get(verdict.sight, "")
 
 
 def banner(status: Status) -> str:
@@ -63,8 +72,9 @@ def banner(status: Status) -> str:
     text = headline(status)
     if status.verdict.sight is Sight.FOLLOWING and status.confidence is not None:
         return _("{headline}  {percent} %").format(headline=text, percent=round(100 * status.confidence))
-    if status.verdict.sight is Sight.STALE and math.isfinite(status.verdict.age_s):
-        return _("{headline} ({age})").format(headline=text, age=age(status.verdict.age_s))
+    if status.verdict.sight is Sight.STALE and 1 <= status.verdict.age_s < math.inf:
+        # In whole seconds: the views are drawn again with each new text.
+        return _("{headline} ({age})").format(headline=text, age=age(math.floor(status.verdict.age_s)))
     return text
 
 
@@ -75,7 +85,7 @@ def age(seconds: float) -> str:
     if seconds < 1:
         return _("{ms} ms").format(ms=round(seconds * 1000))
     if seconds < 120:
-        return _("{s} s").format(s=f"{seconds:.1f}")
+        return _("{s} s").format(s=seconds if isinstance(seconds, int) else f"{seconds:.1f}")
     return _("{min} min").format(min=round(seconds / 60))
 
 
