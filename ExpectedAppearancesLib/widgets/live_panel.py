@@ -79,18 +79,21 @@ class LivePanel:
         """Another module is opened: the session goes on no further, since nobody would see whether to trust it."""
         self._timer.stop()
         self.stop()
+        self.record.close()
         self.layout.leave()
 
     def close(self) -> None:
         """Leave nothing behind: no timer, thread, node, banner or observer."""
         self._timer.stop()
         self.align.close()
+        self.record.close()
         self.controller.close()
         self.layout.leave()
         self.set_parameter_node(None)
 
     def scene_closed(self) -> None:
         """The nodes are gone; threads must not outlive them."""
+        self.record.close()
         self.controller.forget_scene()
         self.align.close()
         self.status.show(IDLE)

@@ -18,6 +18,7 @@ class RecordSection:
 
     def __init__(self, ui, controller: LiveController, parameters, say):
         self._ui, self._controller, self._parameters, self._say = ui, controller, parameters, say
+        self._watched: tuple | None = None
         ui.recordButton.connect("toggled(bool)", self._on_record)
         ui.browserComboBox.connect("currentNodeChanged(vtkMRMLNode*)", self._on_browser)
         ui.replaySlider.connect("valueChanged(int)", self._on_slider)
@@ -42,6 +43,7 @@ class RecordSection:
         else:
             set_text(ui.recordLabel, "")
         browser = self._browser()
+        self._watch(browser)
         ui.exportButton.enabled = browser is not None and not recording
         ui.replaySlider.enabled = browser is not None and not self._controller.running
         if browser is None:
@@ -55,8 +57,25 @@ class RecordSection:
             ui.replaySlider.blockSignals(was_blocked)
         return self._replay(browser)
 
+    def close(self) -> None:
+        """Let go of the recording that is looked at."""
+        self._watch(None)
+
+    def _watch(self, browser) -> None:
+        """Follow a recording at once: Slicer shows its next frame before the next tick, and the overlay is of the last.
+
+        Ticks are rare while nothing runs, and rarer still while the computer is busy.
+        """
+        node, tag = self._watched or (None, None)
+        if node is browser:
+            return
+        if node is not None:
+            node.RemoveObserver(tag)
+        moved = (lambda _caller, _event: self._replay(browser)) if browser is not None else None
+        self._watched = None if browser is None else (browser, browser.AddObserver("ModifiedEvent", moved))
+
     def _replay(self, browser) -> Status | None:
-        if self._controller.running or not self._parameters().casePath:
+        if self._controller.running or self._parameters() is None or not self._parameters().casePath:
             return None
         try:
             self._controller.open_case(self._parameters().casePath)
