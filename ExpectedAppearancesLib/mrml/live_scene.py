@@ -195,9 +195,11 @@ class LiveScene:
             display = self.backdrop.GetDisplayNode()
             display.SetLighting(False)
             display.SetInterpolateTexture(True)
-            display.SetTextureImageDataConnection(self.frame.GetImageDataConnection())
             display.AddViewNodeID(view_id)
             self._backdrop_of = None
+        display, picture = self.backdrop.GetDisplayNode(), self.frame.GetImageDataConnection()
+        if display.GetTextureImageDataConnection() is not picture:  # a recording gives the frame another image
+            display.SetTextureImageDataConnection(picture)
         if self._backdrop_of != (self.camera, self.plane_mm):
             self._backdrop_of = (self.camera, self.plane_mm)
             behind_mm = self.plane_mm + 3 * self._case.vessels.radius_mm

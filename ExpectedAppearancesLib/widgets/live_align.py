@@ -118,7 +118,8 @@ class AlignSection:
     def _solve(self) -> None:
         try:
             rms_px = self._controller.align_to_landmarks(*self._lists)
-            self._say(_("Aligned by landmarks; they are {rms} px off on average (RMS).").format(rms=f"{rms_px:.2f}"))
+            text = _("Aligned by landmarks; they are {rms} px off on average (RMS).")
+            self._say(text.format(rms=f"{rms_px:.2f}"), done=True)
         except InputError as error:
             self._say(str(error))
 
@@ -152,7 +153,7 @@ class AlignSection:
             return
         try:
             path = self._controller.save_truth(folder)
-            self._say(_("Saved to {path}.").format(path=path))
+            self._say(_("Saved to {path}.").format(path=path), done=True)
         except InputError as error:
             self._say(str(error))
 

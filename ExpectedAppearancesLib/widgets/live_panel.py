@@ -24,6 +24,7 @@ from .live_status import StatusSection
 TICK_MS = 4
 # Slicer holds Python's lock while it waits for events: only during this pause do the session's threads get it.
 WAIT_S = 0.008
+PROBLEM_STYLE, DONE_STYLE = "color: #c0392b; font-weight: bold;", "font-weight: bold;"
 IDLE_TICKS = 12  # while nothing runs, one tick in so many does work
 
 
@@ -125,9 +126,10 @@ class LivePanel:
             self.layout.show_mri(p.mriVolume)
         self._show_problem()
 
-    def say(self, text: str) -> None:
-        """A message that stays until the next one."""
+    def say(self, text: str, done: bool = False) -> None:
+        """A message that stays until the next one. done: that something worked, and is no problem."""
         self._message = text
+        self.ui.problemLabel.setStyleSheet(DONE_STYLE if done else PROBLEM_STYLE)
         self._show_problem()
 
     def show_views(self) -> None:

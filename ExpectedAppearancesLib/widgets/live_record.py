@@ -132,4 +132,4 @@ class RecordSection:
         with slicer.util.tryWithErrorDisplay(_("The recording could not be exported."), waitCursor=True):
             space = self._controller.open_case(self._parameters().casePath).space
             path = live_record.export(browser, Path(folder), space)
-            self._say(_("Exported to {path}.").format(path=path))
+            self._say(_("Exported to {path}.").format(path=path), done=True)
