@@ -75,14 +75,16 @@ class RecordSection:
         self._watched = None if browser is None else (browser, browser.AddObserver("ModifiedEvent", moved))
 
     def _replay(self, browser) -> Status | None:
-        if self._controller.running or self._parameters() is None or not self._parameters().casePath:
+        p = self._parameters()
+        # While a scene is loaded Slicer lets timers run: nodes made then would be mixed up with those that come.
+        if self._controller.running or p is None or not p.casePath or slicer.mrmlScene.IsBatchProcessing():
             return None
         try:
-            self._controller.open_case(self._parameters().casePath)
+            self._controller.open_case(p.casePath)
             return self._controller.replay(browser)
         except InputError as error:
             self._say(str(error))
-            self._parameters().browser = None
+            p.browser = None
             return None
 
     def _browser(self):

@@ -79,7 +79,8 @@ class PlanningPanel:
         self.sections["training"].enter()
         self.help.enter()
         self.refresh()
-        self.unfold(self._next)
+        # Back from the Segment Editor: there a photograph is still to be saved.
+        self.unfold("textures" if self.sections["textures"].labelling.nodes else self._next)
 
     def exit(self) -> None:
         self.entered = False
