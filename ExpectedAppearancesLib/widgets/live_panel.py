@@ -10,7 +10,7 @@ from slicer.i18n import tr as _
 
 from ..errors import ExpectedAppearancesError
 from ..geometry.camera import Camera
-from ..live.trust import controls
+from ..live.trust import Controls, controls
 from ..mrml.live_controller import IDLE, LiveController
 from ..mrml.live_scene import OverlayOptions
 from . import live_install
@@ -46,7 +46,7 @@ class LivePanel:
         self.status = StatusSection(ui)
         self.source = SourceSection(ui, self.parameters, self.refresh)
         self.align = AlignSection(ui, controller, self.say)
-        self.record = RecordSection(ui, controller, self.parameters, self.say)
+        self.record = RecordSection(ui, controller, self.parameters, self.say, self.tick_now)
         ui.startButton.connect("clicked(bool)", lambda _checked=False: self.toggle())
         ui.freezeButton.connect("clicked(bool)", self.freeze)
         ui.singleButton.connect("clicked(bool)", lambda _checked=False: self.single())
@@ -167,8 +167,7 @@ class LivePanel:
         self.controller.stop()
         self.align.close()
         self.refresh()
-        self._ticks = -1  # say so now
-        self.tick()
+        self.tick_now()
 
     def freeze(self, checked: bool) -> None:
         if checked:
@@ -186,28 +185,20 @@ class LivePanel:
         live_install.install(self.say)
         self.refresh()
 
+    def tick_now(self) -> None:
+        """Show what has just changed; while nothing runs, the next tick that does so may be far."""
+        self._ticks = -1
+        self.tick()
+
     def tick(self) -> None:
         """Called by the timer, on the GUI thread; short, whatever the session does."""
         running = self.controller.running
         self._ticks += 1
         if not running and self._ticks % IDLE_TICKS:
             return
-        status = self.controller.tick(WAIT_S)
-        has_frame = status.result is not None and status.result.image_rgb is not None
-        can = controls(
-            not self._problem,
-            running,
-            self.controller.frozen,
-            has_frame,
-            self.controller.alignment is not None,
-            self.controller.recorder is not None,
-        )
-        self._remember_camera()
-        replayed = self.record.show(can.record and has_frame)
-        self.align.show(can.align)
-        status = replayed or status
-        self.status.show(status)
-        self.layout.show(status)
+        # Picture, overlay and what is said over them are drawn together, or not yet.
+        with self.controller.drawing_held():
+            can = self._show()
         ui = self.ui
         for widget, enabled in (
             (ui.startButton, can.start or can.stop),
@@ -222,6 +213,26 @@ class LivePanel:
             self._buttons = (running, self.controller.frozen)
             set_text(ui.startButton, _("Stop") if running else _("Start"))
             set_text(ui.singleButton, _("Next frame") if all(self._buttons) else _("Single frame"))
+
+    def _show(self) -> Controls:
+        """Bring views and sections up to date; returns what the user can do now."""
+        status = self.controller.tick(WAIT_S)
+        has_frame = status.result is not None and status.result.image_rgb is not None
+        can = controls(
+            not self._problem,
+            self.controller.running,
+            self.controller.frozen,
+            has_frame,
+            self.controller.alignment is not None,
+            self.controller.recorder is not None,
+        )
+        self._remember_camera()
+        replayed = self.record.show(can.record and has_frame)
+        self.align.show(can.align)
+        status = replayed or status
+        self.status.show(status)
+        self.layout.show(status)
+        return can
 
     def _remember_camera(self) -> None:
         """A of the frame on the screen, in the parameter node: a scene does not save a view's window centre."""

@@ -14,10 +14,12 @@ from .labels import set_text
 
 
 class RecordSection:
-    """parameters: callable that gives the parameter node, or None. say: shows a text to the user."""
+    """parameters: callable that gives the parameter node, or None. say: shows a text to the user. moved: called when
+    a recording that is looked at is at another frame."""
 
-    def __init__(self, ui, controller: LiveController, parameters, say):
+    def __init__(self, ui, controller: LiveController, parameters, say, moved):
         self._ui, self._controller, self._parameters, self._say = ui, controller, parameters, say
+        self._moved = moved
         self._watched: tuple | None = None
         ui.recordButton.connect("toggled(bool)", self._on_record)
         ui.browserComboBox.connect("currentNodeChanged(vtkMRMLNode*)", self._on_browser)
@@ -71,8 +73,13 @@ class RecordSection:
             return
         if node is not None:
             node.RemoveObserver(tag)
-        moved = (lambda _caller, _event: self._replay(browser)) if browser is not None else None
-        self._watched = None if browser is None else (browser, browser.AddObserver("ModifiedEvent", moved))
+        self._watched = None
+        if browser is not None:
+            self._watched = browser, browser.AddObserver("ModifiedEvent", self._on_moved)
+
+    def _on_moved(self, _caller, _event) -> None:
+        if not self._controller.running and not slicer.mrmlScene.IsBatchProcessing():
+            self._moved()
 
     def _replay(self, browser) -> Status | None:
         p = self._parameters()

@@ -13,6 +13,7 @@ import slicer
 from ..evaluation.metrics import add_mm
 from ..live.trust import Sight
 from ..runs import dependencies
+from . import live_texts
 
 MODULE = "ExpectedAppearancesLive"
 LONGEST_TICK_MS = 50.0
@@ -38,6 +39,7 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
     with tempfile.TemporaryDirectory() as folder:
         phantom, widget = started(Path(folder))
         nodes, wrong, ticks_ms = [], [], []
+        distrusted = watch_drawing(widget.panel)
         for _ in range(40):
             status = next_result(test, widget, ticks_ms)
             truth = truth_of(phantom, status.result)
@@ -57,6 +59,7 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
         widget.ui.startButton.click()
         test.assertFalse(widget.panel.controller.running)
         test.assertFalse(threads())
+        test.assertEqual(distrusted, [])
         if slicer.app.layoutManager():
             slicer.util.selectModule("Data")
             test.assertEqual(slicer.app.layoutManager().layout, before)
@@ -178,6 +181,21 @@ def started(folder: Path):
     widget.ui.startButton.enabled = True
     widget.ui.startButton.click()
     return phantom, widget
+
+
+def watch_drawing(panel) -> list:
+    """Collects what stood over the microscope's picture whenever it was drawn with an overlay but not as trusted."""
+    found: list = []
+    for view, banner in panel.layout._banners[:1]:
+
+        def drawn(_caller, _event, banner=banner):
+            live = panel.controller.live
+            trusted = banner._said is not None and banner._said[1] in (live_texts.GREEN, live_texts.AMBER)
+            if live is not None and live.overlay_visible and not trusted:
+                found.append(banner._said)
+
+        view.renderWindow().AddObserver("EndEvent", drawn)
+    return found
 
 
 def truth_of(phantom, result):
