@@ -42,9 +42,14 @@ def test_replay_of_a_saved_scene_gives_the_same_frames_and_poses(application, ph
     loaded.SetURL(str(next((tmp_path / "unpacked").rglob("*.mrml"))))
     assert loaded.Connect()
     again = LiveController(loaded)
-    again.open_case(phantom.case.folder)
     (browser,) = live_record.recordings(loaded)
     assert browser.GetNumberOfItems() == 4
+    # Files keep no attributes of what is recorded, and Slicer copies that onto the nodes as soon as it has loaded.
+    played_into = [browser.GetProxyNode(live_record._sequence(browser, role)) for role in ("frame", "transform")]
+    for node in played_into:
+        node.RemoveAttribute("ExpectedAppearances.Live")
+    again.open_case(phantom.case.folder)
+    assert [again.live.frame, again.live.transform] == played_into
     for i in (0, 1, 2, 3, 1):
         browser.SetSelectedItemNumber(i)
         logic_of_loaded.sequences.UpdateProxyNodesFromSequences(browser)
