@@ -128,6 +128,8 @@ class ExpectedAppearancesLiveWidget(ScriptedLoadableModuleWidget, VTKObservation
         self.addObserver(slicer.mrmlScene, slicer.mrmlScene.EndCloseEvent, self.onSceneEndClose)
         self.addObserver(slicer.mrmlScene, slicer.mrmlScene.EndImportEvent, self.onSceneEndClose)
         self.setParameterNode(self.logic.getParameterNode())
+        if self.parent.isEntered:  # reloaded while it was shown
+            self.panel.enter()
 
     def cleanup(self):
         self.setParameterNode(None)

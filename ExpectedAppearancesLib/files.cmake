@@ -106,6 +106,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/live_banner.py
   ExpectedAppearancesLib/mrml/live_controller.py
   ExpectedAppearancesLib/mrml/live_drawing.py
+  ExpectedAppearancesLib/mrml/live_nodes.py
   ExpectedAppearancesLib/mrml/live_record.py
   ExpectedAppearancesLib/mrml/live_scene.py
   ExpectedAppearancesLib/mrml/live_stream.py

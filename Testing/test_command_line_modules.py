@@ -339,3 +339,14 @@ def test_scripts_find_the_library_of_an_installed_extension(tmp_path):
             command,
             str(root / "qt-scripted-modules" / "ExpectedAppearancesLib" / "runs" / "command_line_module.py") + "\n",
         ]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux only")
+@pytest.mark.parametrize("niceness", [0, 19])
+def test_a_run_gives_way_to_a_slicer_of_the_lowest_priority(niceness):
+    code = (
+        f"import os; os.nice({niceness}); before = os.getpriority(os.PRIO_PROCESS, 0)\n"
+        "from ExpectedAppearancesLib.runs.command_line_module import give_way; give_way()\n"
+        "assert (os.sched_getscheduler(0) == os.SCHED_IDLE) == (before >= 19)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -210,6 +210,16 @@ def test_panel_names_parameters_that_exist(module):
     assert set(bound) <= parameters, set(bound) - parameters
 
 
+@every_module
+def test_panel_is_as_wide_whatever_is_unfolded(module):
+    """Slicer gives a panel the width that its content needs: without a common minimum the views jump."""
+    root = ui_root(module).find("widget")
+    assert int(root.findtext("property[@name='minimumSize']/size/width")) >= 400
+    long_texts = {"deviceCombo", "closingCombo"}  # names of graphics cards, whole sentences
+    for combo in (w for w in root.iter("widget") if w.get("name") in long_texts):
+        assert combo.findtext("property[@name='sizeAdjustPolicy']/enum").endswith("WithIcon")
+
+
 def test_every_number_of_the_planning_panel_has_its_unit():
     for widget in ui_root(MODULE).iter("widget"):
         if widget.get("class") in ("QSpinBox", "QDoubleSpinBox", "ctkSliderWidget"):

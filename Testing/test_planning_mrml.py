@@ -14,7 +14,7 @@ from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
-from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
+from ExpectedAppearancesLib.poses.craniotomy import Craniotomy, find_craniotomy
 
 slicer = pytest.importorskip("slicer")
 import vtk  # noqa: E402 (after the skip)
@@ -187,6 +187,19 @@ def test_label_map_in_the_slice_view_is_the_librarys_pixel_by_pixel(scene, space
     planning.remove_nodes(scene, nodes)
     assert scene.GetNumberOfNodesByClass("vtkMRMLLabelMapVolumeNode") == 0
     assert nodes == {}
+
+
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_the_3d_view_looks_onto_the_craniotomy_as_an_upright_microscope(scene, space):
+    centre, outward, up = np.array([10.0, 20.0, 30.0]), np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0])
+    craniotomy = Craniotomy(centre, outward, up)
+    camera_node = scene.AddNewNodeByClass("vtkMRMLCameraNode")
+    planning.look_onto(camera_node, craniotomy, space)
+    flip = np.array([1.0, 1.0, 1.0] if space == "RAS" else [-1.0, -1.0, 1.0])
+    focal, position = np.array(camera_node.GetFocalPoint()), np.array(camera_node.GetPosition())
+    np.testing.assert_allclose(focal, centre * flip)
+    np.testing.assert_allclose((position - focal) / np.linalg.norm(position - focal), outward * flip, atol=1e-12)
+    np.testing.assert_allclose(camera_node.GetViewUp(), up * flip)
 
 
 def test_photograph_and_labels_survive_the_segment_editors_form(scene):

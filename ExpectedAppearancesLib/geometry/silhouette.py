@@ -38,21 +38,26 @@ class Silhouette:
     def edges_with_inside(self, camera_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `edges` with facing borders only, and for each edge (E,) the third vertex of a triangle at it that faces
         the camera: the side on which the surface is seen."""
-        facing = self._facing(camera_from_world)
-        chosen = self._is_outline(facing, facing_borders_only=True)
-        if not chosen.any():
-            return self._edges[chosen], np.zeros(0, int)
-        side = np.arange(len(self._triangles_at))
-        seen = np.where(self._towards_at(camera_from_world), side, len(side))
-        triangle = self._triangles_at[np.minimum.reduceat(seen, self._first_at)[chosen]]
+        towards_at = self._towards_at(camera_from_world)
+        chosen = np.flatnonzero(self._is_outline(self._count(towards_at), facing_borders_only=True))
+        # At each edge the first of its triangles that faces the camera; only few edges have more than two.
+        first, sides = self._first_at[chosen], self._sides[chosen]
+        side, found = first.copy(), np.zeros(len(chosen), bool)
+        for i in range(sides.max(initial=0)):
+            new = ~found & (i < sides)
+            new[new] = towards_at[first[new] + i]
+            side[new], found = first[new] + i, found | new
         edges = self._edges[chosen]
-        return edges, self._triangles[triangle].sum(axis=1) - edges.sum(axis=1)
+        return edges, self._triangles[self._triangles_at[side]].sum(axis=1) - edges.sum(axis=1)
 
     def _facing(self, camera_from_world: np.ndarray) -> np.ndarray:
         """Number of triangles at each edge that face the camera."""
+        return self._count(self._towards_at(camera_from_world))
+
+    def _count(self, towards_at: np.ndarray) -> np.ndarray:
         if not len(self._edges):
             return np.zeros(0, np.int32)
-        return np.add.reduceat(self._towards_at(camera_from_world).astype(np.int32), self._first_at)
+        return np.add.reduceat(towards_at.astype(np.int32), self._first_at)
 
     def _towards_at(self, camera_from_world: np.ndarray) -> np.ndarray:
         return self.towards(camera_from_world)[self._triangles_at]

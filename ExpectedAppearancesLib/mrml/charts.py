@@ -45,7 +45,7 @@ def show_training(scene, curve: Sequence[dict]):
         series.SetXColumnName("Step")
         series.SetYColumnName(title)
         series.SetPlotType(series.PlotTypeScatter)
-        series.SetLineStyle(series.LineStyleSolid)
+        series.SetLineStyle(series.LineStyleSolid if len(points) > 1 else series.LineStyleNone)
         series.SetMarkerStyle(series.MarkerStyleCircle if len(points) < 40 else series.MarkerStyleNone)
         series.SetColor(*colour)
         series_nodes.append(series)

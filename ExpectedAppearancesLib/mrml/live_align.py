@@ -8,7 +8,8 @@ from ..case.case import Case
 from ..geometry.pose import RAS_FROM_LPS, inverse, transform
 from ..live.alignment import LandmarkPose, pose_from_landmarks
 from . import scene as scenes
-from .live_scene import ROLE_ATTRIBUTE, LiveScene, matrix_of
+from .live_nodes import ROLE_ATTRIBUTE
+from .live_scene import LiveScene, matrix_of
 
 HANDLES, FRAME_LANDMARKS, MESH_LANDMARKS = "handles", "landmarks in frame", "landmarks on mesh"
 

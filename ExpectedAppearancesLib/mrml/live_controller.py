@@ -28,7 +28,8 @@ from ..poses.craniotomy import find_craniotomy
 from . import live_record
 from .live_align import Alignment, pose_of_landmarks
 from .live_drawing import at_once
-from .live_scene import FRAME, LiveScene, OverlayOptions, node_of_role, remove_live_nodes
+from .live_nodes import node_of_role, remove_live_nodes
+from .live_scene import FRAME, LiveScene, OverlayOptions
 from .live_stream import NodeFrames
 
 

@@ -6,6 +6,7 @@ All is saved with the scene by Slicer itself. Replaying puts a frame, its transf
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ from ..geometry.pose import camera_to_ras
 from ..live.recording import RecordedFrame, export_recording, from_note, to_note
 from ..live.session import LiveResult
 from . import scene as scenes
-from .live_scene import FRAME, ROLE_ATTRIBUTE, TRANSFORM, LiveScene, node_of_role
+from .live_nodes import ROLE_ATTRIBUTE, SEQUENCE_ATTRIBUTE, node_of_role
+from .live_scene import FRAME, TRANSFORM, LiveScene
 from .live_stream import pixels_of
 
 NOTE = "note"
-SEQUENCE_ATTRIBUTE = ROLE_ATTRIBUTE + ".Sequence"
 BROWSER_ATTRIBUTE = "ExpectedAppearances.Recording"
 BROWSER_NAME = "Microscope recording"
 DEFAULT_LIMIT_MB = 2048
@@ -127,7 +128,7 @@ def recorded_frames(browser, pixels: bool = True) -> Iterator[tuple[RecordedFram
         image = None
         if pixels:
             image = pixels_of(sequences[FRAME].GetNthDataNode(item).GetImageData())
-        yield RecordedFrame(frame.time_s, frame.name, frame.camera, frame.prediction, image), key
+        yield replace(frame, image_rgb=image), key
 
 
 def frame_at(browser) -> tuple[RecordedFrame, str]:
@@ -148,6 +149,7 @@ def put_back(browser, live_scene: LiveScene) -> None:
         recorded = _sequence(browser, role).GetNthDataNode(browser.GetSelectedItemNumber())
         if node is not None and recorded is not None:
             node.CopyContent(recorded, True)  # deep: a session writes new pixels into the frame's own memory
+            node.SetAttribute(ROLE_ATTRIBUTE, role)  # copied as well, and in a loaded recording there is none
 
 
 def export(browser, folder: Path, space: str) -> Path:

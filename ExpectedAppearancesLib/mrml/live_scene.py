@@ -16,8 +16,8 @@ from ..geometry.pose import camera_to_ras
 from ..live.overlay import Overlay
 from ..live.session import LiveResult
 from . import scene as scenes
+from .live_nodes import ROLE_ATTRIBUTE, mark, node_of_role, remove_live_nodes
 
-ROLE_ATTRIBUTE = "ExpectedAppearances.Live"  # on every node of the live panel: its role
 FIRST_PLANE_MM = 200.0  # where the frame is put up before any pose says how far the vessels are
 PLANE_CHANGE = 0.1  # share by which the vessels' depth may leave the plane before the plane follows
 TRUE_RGB, PREDICTED_RGB = (0.16, 0.86, 0.24), (0.20, 0.43, 1.0)  # the paper's figure: true green, predicted blue
@@ -57,10 +57,10 @@ class LiveScene:
         self._stamp: tuple | None = None
         self.models = scenes.add_case_models(scene, case)
         for name, node in self.models.items():
-            _mark(node, name)
+            mark(node, name)
         self.transform = node_of_role(scene, TRANSFORM)
         if self.transform is None:
-            self.transform = _mark(scenes.add_camera_transform(scene, self.camera_to_ras), TRANSFORM)
+            self.transform = mark(scenes.add_camera_transform(scene, self.camera_to_ras), TRANSFORM)
         else:
             self.camera_to_ras = matrix_of(self.transform)
         self.frame = node_of_role(scene, FRAME)
@@ -186,7 +186,7 @@ class LiveScene:
         if self.frame is None or self.camera is None:
             return
         if self.backdrop is None:
-            self.backdrop = _mark(self._scene.AddNewNodeByClass("vtkMRMLModelNode", "Microscope backdrop"), BACKDROP)
+            self.backdrop = mark(self._scene.AddNewNodeByClass("vtkMRMLModelNode", "Microscope backdrop"), BACKDROP)
             self.backdrop.CreateDefaultDisplayNodes()
             self.backdrop.SetAndObserveTransformNodeID(self.transform.GetID())
             for node in (self.backdrop, self.backdrop.GetDisplayNode()):
@@ -195,9 +195,11 @@ class LiveScene:
             display = self.backdrop.GetDisplayNode()
             display.SetLighting(False)
             display.SetInterpolateTexture(True)
-            display.SetTextureImageDataConnection(self.frame.GetImageDataConnection())
             display.AddViewNodeID(view_id)
             self._backdrop_of = None
+        display, picture = self.backdrop.GetDisplayNode(), self.frame.GetImageDataConnection()
+        if display.GetTextureImageDataConnection() is not picture:  # a recording gives the frame another image
+            display.SetTextureImageDataConnection(picture)
         if self._backdrop_of != (self.camera, self.plane_mm):
             self._backdrop_of = (self.camera, self.plane_mm)
             behind_mm = self.plane_mm + 3 * self._case.vessels.radius_mm
@@ -220,7 +222,7 @@ class LiveScene:
             return False
         self.camera, self.plane_mm = camera, plane_mm
         if self.frustum is None:
-            self.frustum = _mark(scenes.add_frustum(self._scene, camera, plane_mm, self.transform), FRUSTUM)
+            self.frustum = mark(scenes.add_frustum(self._scene, camera, plane_mm, self.transform), FRUSTUM)
             self.frustum.SetSelectable(False)
             self.frustum.SetSaveWithScene(False)
         else:
@@ -230,7 +232,7 @@ class LiveScene:
     def _set_pixels(self, image_rgb: np.ndarray, changed: bool) -> None:
         if self.frame is None:
             self.frame = scenes.add_frame(self._scene, image_rgb, self.camera, self.plane_mm, self.transform)
-            _mark(self.frame, FRAME)
+            mark(self.frame, FRAME)
             return
         was_modifying = self.frame.StartModify()
         if changed:
@@ -249,7 +251,7 @@ class LiveScene:
     def _add_lines(self, role: str):
         from vtkmodules.vtkCommonDataModel import vtkPolyData
 
-        node = _mark(self._scene.AddNewNodeByClass("vtkMRMLModelNode", NAMES[role]), role)
+        node = mark(self._scene.AddNewNodeByClass("vtkMRMLModelNode", NAMES[role]), role)
         node.SetAndObservePolyData(vtkPolyData())
         node.CreateDefaultDisplayNodes()
         node.SetAndObserveTransformNodeID(self.transform.GetID())
@@ -279,7 +281,7 @@ class LiveScene:
 
     def _add_fill(self):
         colours = self._scene.AddNode(_colour_table())
-        node = _mark(self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "Predicted vessels"), FILL)
+        node = mark(self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "Predicted vessels"), FILL)
         _set_image(node, np.zeros((2, 2, 1), np.uint8))
         node.CreateDefaultDisplayNodes()
         node.GetDisplayNode().SetAndObserveColorNodeID(colours.GetID())
@@ -288,44 +290,6 @@ class LiveScene:
         node.SetSaveWithScene(False)
         node.GetDisplayNode().SetSaveWithScene(False)
         return node
-
-
-def node_of_role(scene, role: str):
-    """The live node of that role, or None."""
-    return next((node for node in _nodes(scene) if node.GetAttribute(ROLE_ATTRIBUTE) == role), None)
-
-
-def is_recorded(scene, node) -> bool:
-    """Whether a sequence browser plays into the node."""
-    browsers = scene.GetNodesByClass("vtkMRMLSequenceBrowserNode")
-    browsers.UnRegister(None)
-    return any(browsers.GetItemAsObject(i).IsProxyNode(node.GetID()) for i in range(browsers.GetNumberOfItems()))
-
-
-def remove_live_nodes(scene, but: tuple[str, ...] = ()) -> None:
-    """Take the nodes with a role out of the scene, also those that a saved scene brought along.
-
-    Those that a recording plays into stay, and those of the roles in `but`.
-    """
-    for node in _nodes(scene):
-        role = node.GetAttribute(ROLE_ATTRIBUTE)
-        if not role or role in but or not scene.IsNodePresent(node) or is_recorded(scene, node):
-            continue
-        # Display nodes of a model would stay behind without it.
-        displays = (
-            [node.GetNthDisplayNode(i) for i in range(node.GetNumberOfDisplayNodes())]
-            if (node.IsA("vtkMRMLDisplayableNode"))
-            else []
-        )
-        scene.RemoveNode(node)
-        for display in displays:
-            if display is not None and scene.IsNodePresent(display):
-                scene.RemoveNode(display)
-
-
-def _nodes(scene) -> list:
-    collection = scene.GetNodes()
-    return [collection.GetItemAsObject(i) for i in range(collection.GetNumberOfItems())]
 
 
 def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
@@ -338,11 +302,6 @@ def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
     else:
         transform_node.GetMatrixTransformToParent(matrix)
     return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
-
-
-def _mark(node, role: str):
-    node.SetAttribute(ROLE_ATTRIBUTE, role)
-    return node
 
 
 def _set_visible(model, visible: bool) -> None:
@@ -407,4 +366,4 @@ def _colour_table():
     table.SetNumberOfColors(2)
     table.SetColor(0, "none", 0, 0, 0, 0)
     table.SetColor(1, "vessels", *PREDICTED_RGB, 1)
-    return _mark(table, COLOURS)
+    return mark(table, COLOURS)

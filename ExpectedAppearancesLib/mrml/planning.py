@@ -224,6 +224,16 @@ def look_at_mask(slice_node, camera: Camera, camera_from_world, plane_mm: float,
     slice_node.EndModify(modifying)
 
 
+def look_onto(camera_node, craniotomy: Craniotomy, space: str, distance_mm: float = 200.0) -> None:
+    """Put a 3D view's camera over the craniotomy, upright as an upright microscope, looking at its centre."""
+    to_ras = np.eye(3) if space == "RAS" else RAS_FROM_LPS[:3, :3]
+    centre, outward, up = (to_ras @ v for v in (craniotomy.centre_world_mm, craniotomy.outward_axis, craniotomy.up))
+    camera_node.SetFocalPoint(*centre)
+    camera_node.SetPosition(*(centre + distance_mm * outward))
+    camera_node.SetViewUp(*up)
+    camera_node.ResetClippingRange()
+
+
 def plane_through(centre_world_mm: np.ndarray, camera_from_world: np.ndarray) -> float:
     """Depth, mm, of the plane through a point; at least 1 mm, so that a plane can always be drawn."""
     return max(float(transform(camera_from_world, centre_world_mm)[2]), 1.0)
@@ -241,12 +251,12 @@ def remove_nodes(scene, nodes: dict) -> None:
     """Remove what `nodes` holds from the scene, display and storage nodes included."""
     for node in list(nodes.values()):
         if node is not None and scene.IsNodePresent(node):
-            if node.IsA("vtkMRMLDisplayableNode"):
-                for i in reversed(range(node.GetNumberOfDisplayNodes())):
-                    display = node.GetNthDisplayNode(i)
-                    if display:
-                        scene.RemoveNode(display)
-            scene.RemoveNode(node)
+            displayable = node.IsA("vtkMRMLDisplayableNode")
+            displays = [node.GetNthDisplayNode(i) for i in range(node.GetNumberOfDisplayNodes())] if displayable else []
+            scene.RemoveNode(node)  # first: Slicer's tables look for the display node of a node that is there
+            for display in displays:
+                if display is not None and scene.IsNodePresent(display):
+                    scene.RemoveNode(display)
     nodes.clear()
 
 

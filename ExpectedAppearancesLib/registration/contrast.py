@@ -21,6 +21,8 @@ from .pnp import PoseFit, projection_jacobian
 SHARPER = 2  # frames are looked at in so many times the size that the network reads
 POINTS = 400  # of the outline, at most
 REACH_PX, STEP_PX = 4.0, 0.5  # samples along a normal, to both sides
+OFFSETS_PX = np.arange(-REACH_PX, REACH_PX + STEP_PX / 2, STEP_PX)
+INSIDE, BEYOND = slice(2, 7), slice(10, 15)  # of these, from 1 to 3 px off the outline
 WINDOW_PX = 2.0  # inside and outside are means over so much
 SIGMA_PX = 0.6  # error of an edge that was found
 INDEPENDENT = 60.0  # the whole outline counts as this many independent points: neighbours err together
@@ -64,21 +66,27 @@ class ContrastAligner:
 
     def _descend(self, fit: PoseFit, start: np.ndarray, image_rgb: np.ndarray, camera: Camera) -> Contrast | None:
         image = cv2.GaussianBlur(image_rgb, (0, 0), 0.7).astype(np.float32)
-        dark = cv2.erode((image_rgb.max(axis=2) < DARK).astype(np.uint8), np.ones((3, 3), np.uint8))
+        red, green, blue = cv2.split(image_rgb)
+        lightest = cv2.max(cv2.max(red, green), blue)
+        dark = cv2.erode((lightest < DARK).astype(np.uint8), np.ones((3, 3), np.uint8))
         dark = cv2.dilate(dark, np.ones((5, 5), np.uint8))
         edges, inner = self._silhouette.edges_with_inside(start)
         every = len(edges) // POINTS + 1
-        ends, inner = self._vertices_mm[edges[::every]], self._vertices_mm[inner[::every]]
         centre = fit.centre_world_mm
-        relative = np.ascontiguousarray((ends.mean(axis=1) - centre).T)
+        # The outline's edges from a to b, a vertex within, and the edges' middles; rows of coordinates.
+        corners = np.concatenate([edges[::every, 0], edges[::every, 1], inner[::every]])
+        corners = np.ascontiguousarray((self._vertices_mm[corners] - centre).T)
+        count = len(edges[::every])
+        relative = (corners[:, :count] + corners[:, count : 2 * count]) / 2
         first, origin = fit.camera_from_world[:3, :3], fit.camera_from_world[:3, :3] @ centre
         origin = origin + fit.camera_from_world[:3, 3]
         rotation, position = start[:3, :3], start[:3, :3] @ centre + start[:3, 3]
         prior = np.linalg.inv(fit.covariance * PRIOR)
-        focal = np.array([camera.fx, camera.fy])
+        focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         for _ in range(ITERATIONS):
-            pose = pose_from_rotation(rotation, position - rotation @ centre)
-            a, b, within = (camera.project(x @ pose[:3, :3].T + pose[:3, 3]) for x in (ends[:, 0], ends[:, 1], inner))
+            seen = rotation @ corners + position[:, None]
+            pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
+            a, b, within = (pixels[:, i * count : (i + 1) * count] for i in range(3))
             normals = _outward(a, b, within)
             profile = _Profile((a + b) / 2, normals, image, dark)
             if profile.on_tissue.sum() < LEAST_POINTS:
@@ -86,7 +94,7 @@ class ContrastAligner:
             offsets_px, weight = profile.edges()
             turned = rotation @ relative
             jacobian = projection_jacobian(turned, turned + position[:, None], focal)
-            gradient = normals[:, 0] * jacobian[:, 0] + normals[:, 1] * jacobian[:, 1]
+            gradient = normals[0] * jacobian[:, 0] + normals[1] * jacobian[:, 1]
             weighted = gradient * (weight * INDEPENDENT / (SIGMA_PX**2 * profile.on_tissue.sum()))
             information = weighted @ gradient.T + prior
             gone = np.concatenate([rotation_vector(rotation @ first.T), position - origin])
@@ -111,30 +119,28 @@ class ContrastAligner:
 
 
 def _outward(a_px: np.ndarray, b_px: np.ndarray, within_px: np.ndarray) -> np.ndarray:
-    """Unit normals (E, 2) of the image's segments a-b (E, 2) that point away from `within` (E, 2)."""
-    along = b_px - a_px
-    normals = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    towards = np.einsum("ij,ij->i", normals, within_px - a_px)
-    return np.where(towards[:, None] > 0, -normals, normals)
+    """Unit normals (2, E) of the image's segments a-b (2, E) that point away from `within` (2, E)."""
+    x, y = b_px - a_px
+    across, down = within_px - a_px
+    # Of (y, -x), which is a normal, the direction that points away.
+    scale = np.where(y * across - x * down > 0, -1.0, 1.0) / np.maximum(np.sqrt(x * x + y * y), 1e-9)
+    return np.stack([y * scale, -x * scale])
 
 
 class _Profile:
-    """The image along the normals of points (E, 2), from REACH_PX inside to as much outside."""
-
-    offsets_px = np.arange(-REACH_PX, REACH_PX + STEP_PX / 2, STEP_PX)
+    """The image along the normals (2, E) of points (2, E), from REACH_PX inside to as much outside."""
 
     def __init__(self, points_px: np.ndarray, normals: np.ndarray, image: np.ndarray, dark: np.ndarray):
-        where = (points_px[:, None] + self.offsets_px[:, None] * normals[:, None]).astype(np.float32)
+        where = points_px[:, :, None] + normals[:, :, None] * OFFSETS_PX
+        where = cv2.merge([where[0].astype(np.float32), where[1].astype(np.float32)])
         colours = cv2.remap(image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         outside = cv2.remap(dark, where, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
         self.on_tissue = ~(outside > 0).any(axis=1)
         # Differences across the outline, so that light which changes from place to place does not count.
-        aside = (np.abs(self.offsets_px) >= 1) & (np.abs(self.offsets_px) <= 3)
-        inside, beyond = (colours[:, aside & side].mean(axis=1) for side in (self.offsets_px < 0, self.offsets_px > 0))
-        across = (inside - beyond)[self.on_tissue]
+        across = (colours[:, INSIDE].mean(axis=1) - colours[:, BEYOND].mean(axis=1))[self.on_tissue].astype(float)
         mean = across.mean(axis=0) if len(across) else np.zeros(3)
-        spread = np.cov(across.T) + 4 * np.eye(3) if len(across) > 3 else np.eye(3)
+        apart = across - mean
+        spread = apart.T @ apart / (len(across) - 1) + 4 * np.eye(3) if len(across) > 3 else np.eye(3)
         axis = np.linalg.solve(spread, mean)
         self._values = colours @ axis
         self._expected = max(float(mean @ axis), 1e-9)
@@ -143,16 +149,17 @@ class _Profile:
     def edges(self) -> tuple[np.ndarray, np.ndarray]:
         """Offset of the step along each normal that is most like the expected one, px (E,), and its weight (E,)."""
         window = round(WINDOW_PX / STEP_PX)
-        total = np.cumsum(np.pad(self._values, ((0, 0), (1, 0))), axis=1)
-        at = np.arange(window, len(self.offsets_px) - window)
-        inside = total[:, at] - total[:, at - window]
-        beyond = total[:, at + 1 + window] - total[:, at + 1]
-        response = (inside - beyond) / (window * self._expected)
-        best = np.clip(response.argmax(axis=1), 1, len(at) - 2)
-        before, peak, after = (np.take_along_axis(response, (best + i)[:, None], 1)[:, 0] for i in (-1, 0, 1))
+        # Column i: the sum of the `window` samples from the i-th on.
+        sums = self._values[:, : 1 - window].copy()
+        for i in range(1, window):
+            sums += self._values[:, i : i + sums.shape[1]]
+        at = np.arange(window, len(OFFSETS_PX) - window)
+        response = (sums[:, : len(at)] - sums[:, window + 1 :]) / (window * self._expected)
+        best, rows = np.clip(response.argmax(axis=1), 1, len(at) - 2), np.arange(len(response))
+        before, peak, after = (response[rows, best + i] for i in (-1, 0, 1))
         bend = before - 2 * peak + after
         between = np.where(bend < -1e-9, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
-        offsets_px = self.offsets_px[at[best]] + STEP_PX * np.clip(between, -1, 1)
+        offsets_px = OFFSETS_PX[at[best]] + STEP_PX * np.clip(between, -1, 1)
         farthest = REACH_PX - WINDOW_PX + STEP_PX
         near = np.clip(1 - (offsets_px / farthest) ** 2, 0, 1) ** 2
         is_peak = (peak >= before) & (peak >= after)

@@ -23,6 +23,7 @@ class AlignSection:
         self._lists: tuple | None = None
         self._sliders = [getattr(ui, f"{name}Slider") for name in SLIDERS]
         self._moving_sliders = False
+        self._aligning: bool | None = None
         self._difference: tuple | None = None
         ui.alignButton.connect("toggled(bool)", self._on_align)
         for slider in self._sliders:
@@ -49,9 +50,11 @@ class AlignSection:
         if not aligning and self._start is not None:
             self._end()
         ui.alignButton.enabled = can_align or aligning
-        ui.alignButton.text = _("Keep this pose") if aligning else _("Align the vessels to this frame")
-        for widget in (*self._sliders, ui.frameLandmarkButton, ui.meshLandmarkButton, ui.clearLandmarksButton):
-            widget.enabled = aligning
+        if self._aligning is not aligning:
+            self._aligning = aligning
+            ui.alignButton.text = _("Keep this pose") if aligning else _("Align the vessels to this frame")
+            for widget in (*self._sliders, ui.frameLandmarkButton, ui.meshLandmarkButton, ui.clearLandmarksButton):
+                widget.enabled = aligning
         if aligning:
             self._follow_handles()
             self._show_landmarks()
@@ -115,7 +118,8 @@ class AlignSection:
     def _solve(self) -> None:
         try:
             rms_px = self._controller.align_to_landmarks(*self._lists)
-            self._say(_("Aligned by landmarks; they are {rms} px off on average (RMS).").format(rms=f"{rms_px:.2f}"))
+            text = _("Aligned by landmarks; they are {rms} px off on average (RMS).")
+            self._say(text.format(rms=f"{rms_px:.2f}"), done=True)
         except InputError as error:
             self._say(str(error))
 
@@ -149,7 +153,7 @@ class AlignSection:
             return
         try:
             path = self._controller.save_truth(folder)
-            self._say(_("Saved to {path}.").format(path=path))
+            self._say(_("Saved to {path}.").format(path=path), done=True)
         except InputError as error:
             self._say(str(error))
 

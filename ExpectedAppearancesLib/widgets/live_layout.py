@@ -30,7 +30,9 @@ class LayoutSection:
         if manager is None:
             return None
         layout_node = manager.layoutLogic().GetLayoutNode()
-        if layout_node.GetViewArrangement() not in self._layout_ids(layout_node):
+        # A scene that is being closed has no layout for a moment: the one to go back to is then known from before.
+        ours = self._layout_ids(layout_node) | {slicer.vtkMRMLLayoutNode.SlicerLayoutNone}
+        if layout_node.GetViewArrangement() not in ours:
             self._before = layout_node.GetViewArrangement()
         elif self._before is None:
             self._before = slicer.vtkMRMLLayoutNode.SlicerLayoutConventionalView

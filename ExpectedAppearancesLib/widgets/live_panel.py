@@ -10,7 +10,7 @@ from slicer.i18n import tr as _
 
 from ..errors import ExpectedAppearancesError
 from ..geometry.camera import Camera
-from ..live.trust import controls
+from ..live.trust import Controls, controls
 from ..mrml.live_controller import IDLE, LiveController
 from ..mrml.live_scene import OverlayOptions
 from ..mrml.mri import scan_to_show
@@ -25,6 +25,7 @@ from .live_status import StatusSection
 TICK_MS = 4
 # Slicer holds Python's lock while it waits for events: only during this pause do the session's threads get it.
 WAIT_S = 0.008
+PROBLEM_STYLE, DONE_STYLE = "color: #c0392b; font-weight: bold;", "font-weight: bold;"
 IDLE_TICKS = 12  # while nothing runs, one tick in so many does work
 
 
@@ -40,12 +41,13 @@ class LivePanel:
         self._problem = ""
         self._missing = live_install.problem()
         self._ticks = 0
+        self._buttons: tuple | None = None
         self._camera = None
         self.layout = LayoutSection()
         self.status = StatusSection(ui)
         self.source = SourceSection(ui, self.parameters, self.refresh)
         self.align = AlignSection(ui, controller, self.say)
-        self.record = RecordSection(ui, controller, self.parameters, self.say)
+        self.record = RecordSection(ui, controller, self.parameters, self.say, self.tick_now)
         ui.startButton.connect("clicked(bool)", lambda _checked=False: self.toggle())
         ui.freezeButton.connect("clicked(bool)", self.freeze)
         ui.singleButton.connect("clicked(bool)", lambda _checked=False: self.single())
@@ -79,18 +81,21 @@ class LivePanel:
         """Another module is opened: the session goes on no further, since nobody would see whether to trust it."""
         self._timer.stop()
         self.stop()
+        self.record.close()
         self.layout.leave()
 
     def close(self) -> None:
         """Leave nothing behind: no timer, thread, node, banner or observer."""
         self._timer.stop()
         self.align.close()
+        self.record.close()
         self.controller.close()
         self.layout.leave()
         self.set_parameter_node(None)
 
     def scene_closed(self) -> None:
         """The nodes are gone; threads must not outlive them."""
+        self.record.close()
         self.controller.forget_scene()
         self.align.close()
         self.status.show(IDLE)
@@ -127,9 +132,10 @@ class LivePanel:
             self.layout.show_mri(p.mriVolume)
         self._show_problem()
 
-    def say(self, text: str) -> None:
-        """A message that stays until the next one."""
+    def say(self, text: str, done: bool = False) -> None:
+        """A message that stays until the next one. done: that something worked, and is no problem."""
         self._message = text
+        self.ui.problemLabel.setStyleSheet(DONE_STYLE if done else PROBLEM_STYLE)
         self._show_problem()
 
     def show_views(self) -> None:
@@ -179,8 +185,7 @@ class LivePanel:
         self.controller.stop()
         self.align.close()
         self.refresh()
-        self._ticks = -1  # say so now
-        self.tick()
+        self.tick_now()
 
     def freeze(self, checked: bool) -> None:
         if checked:
@@ -198,17 +203,42 @@ class LivePanel:
         live_install.install(self.say)
         self.refresh()
 
+    def tick_now(self) -> None:
+        """Show what has just changed; while nothing runs, the next tick that does so may be far."""
+        self._ticks = -1
+        self.tick()
+
     def tick(self) -> None:
         """Called by the timer, on the GUI thread; short, whatever the session does."""
         running = self.controller.running
         self._ticks += 1
         if not running and self._ticks % IDLE_TICKS:
             return
+        # Picture, overlay and what is said over them are drawn together, or not yet.
+        with self.controller.drawing_held():
+            can = self._show()
+        ui = self.ui
+        for widget, enabled in (
+            (ui.startButton, can.start or can.stop),
+            (ui.freezeButton, can.freeze),
+            (ui.singleButton, can.single),
+        ):
+            if widget.enabled != enabled:
+                widget.enabled = enabled
+        if ui.freezeButton.checked != self.controller.frozen:
+            ui.freezeButton.checked = self.controller.frozen
+        if self._buttons != (running, self.controller.frozen):
+            self._buttons = (running, self.controller.frozen)
+            set_text(ui.startButton, _("Stop") if running else _("Start"))
+            set_text(ui.singleButton, _("Next frame") if all(self._buttons) else _("Single frame"))
+
+    def _show(self) -> Controls:
+        """Bring views and sections up to date; returns what the user can do now."""
         status = self.controller.tick(WAIT_S)
         has_frame = status.result is not None and status.result.image_rgb is not None
         can = controls(
             not self._problem,
-            running,
+            self.controller.running,
             self.controller.frozen,
             has_frame,
             self.controller.alignment is not None,
@@ -220,19 +250,7 @@ class LivePanel:
         status = replayed or status
         self.status.show(status)
         self.layout.show(status)
-        ui = self.ui
-        for widget, enabled in (
-            (ui.startButton, can.start or can.stop),
-            (ui.freezeButton, can.freeze),
-            (ui.singleButton, can.single),
-        ):
-            if widget.enabled != enabled:
-                widget.enabled = enabled
-        set_text(ui.startButton, _("Stop") if running else _("Start"))
-        if ui.freezeButton.checked != self.controller.frozen:
-            ui.freezeButton.checked = self.controller.frozen
-        single = _("Next frame") if running and self.controller.frozen else _("Single frame")
-        set_text(ui.singleButton, single)
+        return can
 
     def _remember_camera(self) -> None:
         """A of the frame on the screen, in the parameter node: a scene does not save a view's window centre."""

@@ -14,10 +14,13 @@ from .labels import set_text
 
 
 class RecordSection:
-    """parameters: callable that gives the parameter node, or None. say: shows a text to the user."""
+    """parameters: callable that gives the parameter node, or None. say: shows a text to the user. moved: called when
+    a recording that is looked at is at another frame."""
 
-    def __init__(self, ui, controller: LiveController, parameters, say):
+    def __init__(self, ui, controller: LiveController, parameters, say, moved):
         self._ui, self._controller, self._parameters, self._say = ui, controller, parameters, say
+        self._moved = moved
+        self._watched: tuple | None = None
         ui.recordButton.connect("toggled(bool)", self._on_record)
         ui.browserComboBox.connect("currentNodeChanged(vtkMRMLNode*)", self._on_browser)
         ui.replaySlider.connect("valueChanged(int)", self._on_slider)
@@ -42,6 +45,7 @@ class RecordSection:
         else:
             set_text(ui.recordLabel, "")
         browser = self._browser()
+        self._watch(browser)
         ui.exportButton.enabled = browser is not None and not recording
         ui.replaySlider.enabled = browser is not None and not self._controller.running
         if browser is None:
@@ -55,15 +59,39 @@ class RecordSection:
             ui.replaySlider.blockSignals(was_blocked)
         return self._replay(browser)
 
+    def close(self) -> None:
+        """Let go of the recording that is looked at."""
+        self._watch(None)
+
+    def _watch(self, browser) -> None:
+        """Follow a recording at once: Slicer shows its next frame before the next tick, and the overlay is of the last.
+
+        Ticks are rare while nothing runs, and rarer still while the computer is busy.
+        """
+        node, tag = self._watched or (None, None)
+        if node is browser:
+            return
+        if node is not None:
+            node.RemoveObserver(tag)
+        self._watched = None
+        if browser is not None:
+            self._watched = browser, browser.AddObserver("ModifiedEvent", self._on_moved)
+
+    def _on_moved(self, _caller, _event) -> None:
+        if not self._controller.running and not slicer.mrmlScene.IsBatchProcessing():
+            self._moved()
+
     def _replay(self, browser) -> Status | None:
-        if self._controller.running or not self._parameters().casePath:
+        p = self._parameters()
+        # While a scene is loaded Slicer lets timers run: nodes made then would be mixed up with those that come.
+        if self._controller.running or p is None or not p.casePath or slicer.mrmlScene.IsBatchProcessing():
             return None
         try:
-            self._controller.open_case(self._parameters().casePath)
+            self._controller.open_case(p.casePath)
             return self._controller.replay(browser)
         except InputError as error:
             self._say(str(error))
-            self._parameters().browser = None
+            p.browser = None
             return None
 
     def _browser(self):
@@ -113,4 +141,4 @@ class RecordSection:
         with slicer.util.tryWithErrorDisplay(_("The recording could not be exported."), waitCursor=True):
             space = self._controller.open_case(self._parameters().casePath).space
             path = live_record.export(browser, Path(folder), space)
-            self._say(_("Exported to {path}.").format(path=path))
+            self._say(_("Exported to {path}.").format(path=path), done=True)

@@ -12,7 +12,9 @@ import slicer
 
 from ..evaluation.metrics import add_mm
 from ..live.trust import Sight
+from ..mrml.live_record import frame_at
 from ..runs import dependencies
+from . import live_texts
 
 MODULE = "ExpectedAppearancesLive"
 LONGEST_TICK_MS = 50.0
@@ -38,6 +40,7 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
     with tempfile.TemporaryDirectory() as folder:
         phantom, widget = started(Path(folder))
         nodes, wrong, ticks_ms = [], [], []
+        distrusted = watch_drawing(widget.panel)
         for _ in range(40):
             status = next_result(test, widget, ticks_ms)
             truth = truth_of(phantom, status.result)
@@ -57,6 +60,7 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
         widget.ui.startButton.click()
         test.assertFalse(widget.panel.controller.running)
         test.assertFalse(threads())
+        test.assertEqual(distrusted, [])
         if slicer.app.layoutManager():
             slicer.util.selectModule("Data")
             test.assertEqual(slicer.app.layoutManager().layout, before)
@@ -65,17 +69,25 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
 def scene_close_and_reload_in_mid_stream_leave_nothing(test) -> None:
     if not registration_is_installed(test):
         return
+    manager = slicer.app.layoutManager()
+    if manager:
+        slicer.util.selectModule("Data")
+        before = manager.layout
     with tempfile.TemporaryDirectory() as folder:
         _phantom, widget = started(Path(folder))
         next_result(test, widget)
         slicer.mrmlScene.Clear()
         test.assertFalse(widget.panel.controller.running)
         test.assertFalse(threads())
+        if manager:
+            slicer.util.selectModule("Data")
+            test.assertEqual(manager.layout, before)
         clean = slicer.mrmlScene.GetNumberOfNodes()
         _phantom, widget = started(Path(folder))
         next_result(test, widget)
         if slicer.app.layoutManager():
             slicer.util.reloadScriptedModule(MODULE)
+            test.assertTrue(slicer.util.getModuleWidget(MODULE).panel.layout.active)
         else:
             widget.cleanup()
         test.assertFalse(threads())
@@ -98,9 +110,11 @@ def records_and_replays(test) -> None:
         browser = widget.panel.parameters().browser
         test.assertGreaterEqual(browser.GetNumberOfItems(), 6)
         controller = widget.panel.controller
-        for item in (0, 3, 1):
+        for item, wait_s in ((0, 0.0), (3, 0.0), (3, 0.3), (1, 0.0)):  # at once, and when Slicer has done the rest
             widget.ui.replaySlider.value = item
-            pump(0.5)
+            pump(wait_s)
+            recorded = frame_at(browser)[0]
+            until(test, lambda at_s=recorded.time_s: controller.result.frame.taken_s == at_s)
             pose = controller.result.prediction.camera_from_world
             test.assertEqual(controller.live.overlay_visible, controller.result.prediction.accepted)
             if not controller.result.prediction.accepted:
@@ -172,6 +186,21 @@ def started(folder: Path):
     return phantom, widget
 
 
+def watch_drawing(panel) -> list:
+    """Collects what stood over the microscope's picture whenever it was drawn with an overlay but not as trusted."""
+    found: list = []
+    for view, banner in panel.layout._banners[:1]:
+
+        def drawn(_caller, _event, banner=banner):
+            live = panel.controller.live
+            trusted = banner._said is not None and banner._said[1] in (live_texts.GREEN, live_texts.AMBER)
+            if live is not None and live.overlay_visible and not trusted:
+                found.append(banner._said)
+
+        view.renderWindow().AddObserver("EndEvent", drawn)
+    return found
+
+
 def truth_of(phantom, result):
     """The true pose of a frame of the sample, or None for one that has none."""
     from ..demo.phantom import COVERED
@@ -180,7 +209,7 @@ def truth_of(phantom, result):
     return None if number in COVERED else phantom.pose(number / 24)
 
 
-def next_result(test, widget, ticks_ms: list | None = None, timeout_s: float = 20.0):
+def next_result(test, widget, ticks_ms: list | None = None, timeout_s: float = 60.0):
     """Let Slicer work until another frame is shown; returns the status. ticks_ms: takes how long each tick was."""
     controller, seen = widget.panel.controller, widget.panel.controller.result
     end = time.monotonic() + timeout_s
@@ -194,6 +223,16 @@ def next_result(test, widget, ticks_ms: list | None = None, timeout_s: float = 2
             return controller.status
     test.fail(f"no frame came: {controller.status}")
     return None
+
+
+def until(test, condition, timeout_s: float = 60.0) -> None:
+    """Let Slicer work until the condition holds."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > end:
+            test.fail("did not happen in time")
+        slicer.app.processEvents()
+        time.sleep(0.005)
 
 
 def pump(seconds: float) -> None:

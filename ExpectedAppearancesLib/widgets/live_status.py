@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import time
+
 from slicer.i18n import tr as _
 
 from ..mrml.live_controller import Status
 from . import live_texts
 from .labels import set_text
 
+NUMBERS_S = 0.15  # the numbers are read, not watched: each new text lays out the panel
+
 
 class StatusSection:
     def __init__(self, ui):
         self._ui = ui
         self._said: tuple | None = None
+        self._numbers_due_s = 0.0
         for name in ("confidence", "latency", "age", "dropped"):
             getattr(ui, f"{name}Label").setStyleSheet("font-size: 15pt; font-weight: bold;")
 
@@ -29,6 +34,9 @@ class StatusSection:
             ui.headlineLabel.setStyleSheet("font-size: 17pt; font-weight: bold;")
             ui.headlineLabel.text = said[1]
             ui.detailLabel.text = said[2]
+        elif time.monotonic() < self._numbers_due_s:
+            return
+        self._numbers_due_s = time.monotonic() + NUMBERS_S
         confidence = status.confidence
         set_text(ui.confidenceLabel, "–" if confidence is None else f"{round(100 * confidence)} %")
         ui.confidenceBar.value = 0 if confidence is None else round(100 * confidence)

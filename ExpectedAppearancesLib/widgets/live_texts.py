@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 from slicer.i18n import tr as _
@@ -19,10 +20,10 @@ COLOURS = dict.fromkeys(Sight, RED) | {
 }
 
 
-def headline(status: Status) -> str:
-    """A few words that can be read across the room; also drawn over the frame."""
-    verdict = status.verdict
-    texts = {
+# Translated once: asking for a translation takes longer than a tick may.
+@functools.cache
+def _headlines() -> dict[Sight, str]:
+    return {
         Sight.IDLE: _("NOT LIVE"),
         Sight.WAITING: _("WAITING FOR A PICTURE"),
         Sight.LOST: _("NO PICTURE: source lost"),
@@ -36,7 +37,27 @@ def headline(status: Status) -> str:
         Sight.FOLLOWING: _("FOLLOWING"),
         Sight.FOUND: _("FOLLOWING: found again"),
     }
-    return texts[verdict.sight]
+
+
+@functools.cache
+def _details() -> dict[Sight, str]:
+    return {
+        Sight.IDLE: _("Choose a case and a source, then press Start."),
+        Sight.WAITING: _("Started; no frame has come yet."),
+        Sight.LOST: _("The source gives no frames; it is tried again every second."),
+        Sight.OTHER_CASE: _("These frames were registered to the vessels of another case. Open that case."),
+        Sight.STALE: _("No new frame has come in time. The picture on the screen is not the present."),
+        Sight.REFUSED: _("The vessels were not found with enough confidence. Clear the view, or focus again."),
+        Sight.VIEW_LOST: _("No overlay until three frames within a second agree on where the vessels are."),
+        Sight.FROZEN: _("The overlay belongs to this frame. Press Freeze again to go on."),
+        Sight.FOLLOWING: _("The overlay belongs to the newest frame. Not for clinical use."),
+        Sight.FOUND: _("The view was lost and is found again. Compare the overlay with what you see."),
+    }
+
+
+def headline(status: Status) -> str:
+    """A few words that can be read across the room; also drawn over the frame."""
+    return _headlines()[status.verdict.sight]
 
 
 def detail(status: Status) -> str:
@@ -50,19 +71,7 @@ def detail(status: Status) -> str:
         return _("A recorded frame, with the pose that it had.")
     if verdict.sight is Sight.REFUSED and _disagrees(status.result):
         return _("This frame's pose does not fit those before it, so it is not shown.")
-    texts = {
-        Sight.IDLE: _("Choose a case and a source, then press Start."),
-        Sight.WAITING: _("Started; no frame has come yet."),
-        Sight.LOST: _("The source gives no frames; it is tried again every second."),
-        Sight.OTHER_CASE: _("These frames were registered to the vessels of another case. Open that case."),
-        Sight.STALE: _("No new frame has come in time. The picture on the screen is not the present."),
-        Sight.REFUSED: _("The vessels were not found with enough confidence. Clear the view, or focus again."),
-        Sight.VIEW_LOST: _("No overlay until three frames within a second agree on where the vessels are."),
-        Sight.FROZEN: _("The overlay belongs to this frame. Press Freeze again to go on."),
-        Sight.FOLLOWING: _("The overlay belongs to the newest frame. Not for clinical use."),
-        Sight.FOUND: _("The view was lost and is found again. Compare the overlay with what you see."),
-    }
-    return texts.get(verdict.sight, "")
+    return _details().get(verdict.sight, "")
 
 
 def _disagrees(result) -> bool:
@@ -75,8 +84,9 @@ def banner(status: Status) -> str:
     text = headline(status)
     if status.verdict.sight in (Sight.FOLLOWING, Sight.FOUND) and status.confidence is not None:
         return _("{headline}  {percent} %").format(headline=text, percent=round(100 * status.confidence))
-    if status.verdict.sight is Sight.STALE and math.isfinite(status.verdict.age_s):
-        return _("{headline} ({age})").format(headline=text, age=age(status.verdict.age_s))
+    if status.verdict.sight is Sight.STALE and 1 <= status.verdict.age_s < math.inf:
+        # In whole seconds: the views are drawn again with each new text.
+        return _("{headline} ({age})").format(headline=text, age=age(math.floor(status.verdict.age_s)))
     return text
 
 
@@ -87,7 +97,7 @@ def age(seconds: float) -> str:
     if seconds < 1:
         return _("{ms} ms").format(ms=round(seconds * 1000))
     if seconds < 120:
-        return _("{s} s").format(s=f"{seconds:.1f}")
+        return _("{s} s").format(s=seconds if isinstance(seconds, int) else f"{seconds:.1f}")
     return _("{min} min").format(min=round(seconds / 60))
 
 

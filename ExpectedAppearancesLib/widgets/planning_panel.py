@@ -12,6 +12,7 @@ from slicer.i18n import tr as _
 
 from ..case.recorded import Recorded
 from ..case.steps import STEPS, Step, StepState, next_step
+from ..mrml import planning
 from ..mrml.planning_adopt import adopt
 from ..mrml.planning_session import PlanningSession
 from ..runs.closing import OnClose, close_runs, going_on, question
@@ -81,7 +82,8 @@ class PlanningPanel:
         self.sections["training"].enter()
         self.help.enter()
         self.refresh()
-        self.unfold(self._next)
+        # Back from the Segment Editor: there a photograph is still to be saved.
+        self.unfold("textures" if self.sections["textures"].labelling.nodes else self._next)
 
     def exit(self) -> None:
         self.entered = False
@@ -152,16 +154,31 @@ class PlanningPanel:
             self.loading = True
             try:
                 with slicer.util.tryWithErrorDisplay(_("The case could not be opened."), waitCursor=True):
-                    if adopt(self.session, self.parameters, self.scene) is None:
+                    with slicer.util.RenderBlocker():
+                        case = adopt(self.session, self.parameters, self.scene)
+                    if case is None:
                         slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
-                    elif slicer.app.layoutManager():
-                        slicer.util.resetThreeDViews()
+                    else:
+                        self._look_at_case()
             finally:
                 self.loading = False
         self.refresh()
         if take_over:
             self.sections["case"].show_scan()
         self.unfold(self._next)
+
+    def _look_at_case(self) -> None:
+        """Turn the first 3D view to where the surgeon looks from: edge-on a cortex shows nothing."""
+        manager = slicer.app.layoutManager()
+        if manager is None or not manager.threeDViewCount:
+            return
+        widget = manager.threeDWidget(0)
+        camera_node = slicer.modules.cameras.logic().GetViewActiveCameraNode(widget.mrmlViewNode())
+        if camera_node is not None:
+            craniotomy = self.session.craniotomy(self.parameters)
+            planning.look_onto(camera_node, craniotomy, self.session.space(self.parameters))
+        widget.threeDView().resetFocalPoint()
+        widget.threeDView().resetCamera(False, True, True)
 
     def unfold(self, name: str) -> None:
         """Open the section of one step and close the others."""

@@ -157,16 +157,17 @@ class PosesSection(Section):
         renderer = self._renderer_of(vessels, cortex, sampler, camera)
         labels = renderer.render(pose)
         plane_mm = planning.plane_through(sampler.craniotomy.centre_world_mm, pose)
-        volume = planning.show_mask(scene, self._seen, labels, camera, pose, plane_mm, space)
-        self._seen["camera"] = planning.line_model(
-            scene,
-            self._seen.get("camera"),
-            planning.LOOKED_THROUGH,
-            planning.frustum_polydata(camera, pose[None], np.array([plane_mm]), space),
-            planning.LOOKED_THROUGH_COLOUR,
-            2.0,
-        )
-        self._show_slice(volume, camera, pose, plane_mm, space)
+        with slicer.util.RenderBlocker():  # a busy Slicer would draw each change on its own
+            volume = planning.show_mask(scene, self._seen, labels, camera, pose, plane_mm, space)
+            self._seen["camera"] = planning.line_model(
+                scene,
+                self._seen.get("camera"),
+                planning.LOOKED_THROUGH,
+                planning.frustum_polydata(camera, pose[None], np.array([plane_mm]), space),
+                planning.LOOKED_THROUGH_COLOUR,
+                2.0,
+            )
+            self._show_slice(volume, camera, pose, plane_mm, space)
         tilt, distance_mm = planning.view_direction(pose, sampler.craniotomy)
         self.ui.lookCaption.text = _("Camera {number} of {count}: tilt {tilt:.0f}°, {distance:.0f} mm away").format(
             number=p.poseIndex + 1, count=p.poseCount, tilt=tilt, distance=distance_mm
@@ -205,12 +206,15 @@ class PosesSection(Section):
 
     def _stop_looking(self) -> None:
         self._looked = None
-        if self._slice_before is not None:
-            self._slice_before.restore(self.panel.scene)
-            self._slice_before = None
-        planning.remove_nodes(self.panel.scene, self._seen)
-        self._drop_renderer()
         self.ui.lookCaption.text = ""
+        if self._slice_before is None and not self._seen and self._renderer is None:
+            return
+        with slicer.util.RenderBlocker():
+            if self._slice_before is not None:
+                self._slice_before.restore(self.panel.scene)
+                self._slice_before = None
+            planning.remove_nodes(self.panel.scene, self._seen)
+        self._drop_renderer()
 
     def leave(self) -> None:
         self._stepper.stop()

@@ -38,7 +38,7 @@ def allow(button, reason: str, otherwise: str) -> None:
     if button.enabled == bool(reason):
         button.enabled = not reason
     text = reason or otherwise
-    if button.toolTip != text:
+    if button.toolTip not in (text, f"<p>{text}</p>"):  # Slicer makes a paragraph of it, so that long ones are wrapped
         button.toolTip = text
 
 

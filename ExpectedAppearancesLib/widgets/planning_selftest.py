@@ -172,6 +172,7 @@ def test_photograph_becomes_a_texture(test) -> None:
         test.assertTrue((proposed == VESSELS).any())
         panel = open_panel()
         test.assertFalse(panel.ui.addPhotographButton.enabled)
+        test.assertFalse(panel.ui.texturesSection.collapsed)  # where the photograph is saved
         panel.ui.useLabelsButton.click()
         test.assertEqual(labelling_.nodes, {})
         panel.unfold("textures")

@@ -118,7 +118,8 @@ class TrainingSection(Section):
         version = (len(curve), curve[-1]["step"]) if curve else None
         if curve and version != self._plotted and charts.chart_of(self.panel.scene, "training.chart"):
             self._plotted = version
-            charts.show_training(self.panel.scene, curve)
+            with slicer.util.RenderBlocker():
+                charts.show_training(self.panel.scene, curve)
 
     def _curve(self, case) -> list[dict]:
         """What the last checkpoint holds, then what the run has told since."""

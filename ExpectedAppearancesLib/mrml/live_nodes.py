@@ -1,0 +1,66 @@
+"""The nodes of the live panel, found again by the role that each has in an attribute."""
+
+from __future__ import annotations
+
+ROLE_ATTRIBUTE = "ExpectedAppearances.Live"  # on every node of the live panel: its role
+SEQUENCE_ATTRIBUTE = ROLE_ATTRIBUTE + ".Sequence"  # on every sequence of a recording: the role of what it plays into
+
+
+def mark(node, role: str):
+    node.SetAttribute(ROLE_ATTRIBUTE, role)
+    return node
+
+
+def node_of_role(scene, role: str):
+    """The live node of that role, or None."""
+    found = next((node for node in _nodes(scene) if node.GetAttribute(ROLE_ATTRIBUTE) == role), None)
+    return found if found is not None else _played_into(scene, role)
+
+
+def _played_into(scene, role: str):
+    """The node that a recording plays into: of a loaded one Slicer copies the attributes too, and files keep none."""
+    for browser in _browsers(scene):
+        for sequence in _nodes(scene):
+            if sequence.GetAttribute(SEQUENCE_ATTRIBUTE) == role and browser.IsSynchronizedSequenceNodeID(
+                sequence.GetID(), True
+            ):
+                node = browser.GetProxyNode(sequence)
+                return None if node is None else mark(node, role)
+    return None
+
+
+def _browsers(scene) -> list:
+    browsers = scene.GetNodesByClass("vtkMRMLSequenceBrowserNode")
+    browsers.UnRegister(None)
+    return [browsers.GetItemAsObject(i) for i in range(browsers.GetNumberOfItems())]
+
+
+def is_recorded(scene, node) -> bool:
+    """Whether a sequence browser plays into the node."""
+    return any(browser.IsProxyNode(node.GetID()) for browser in _browsers(scene))
+
+
+def remove_live_nodes(scene, but: tuple[str, ...] = ()) -> None:
+    """Take the nodes with a role out of the scene, also those that a saved scene brought along.
+
+    Those that a recording plays into stay, and those of the roles in `but`.
+    """
+    for node in _nodes(scene):
+        role = node.GetAttribute(ROLE_ATTRIBUTE)
+        if not role or role in but or not scene.IsNodePresent(node) or is_recorded(scene, node):
+            continue
+        # Display nodes of a model would stay behind without it.
+        displays = (
+            [node.GetNthDisplayNode(i) for i in range(node.GetNumberOfDisplayNodes())]
+            if (node.IsA("vtkMRMLDisplayableNode"))
+            else []
+        )
+        scene.RemoveNode(node)
+        for display in displays:
+            if display is not None and scene.IsNodePresent(display):
+                scene.RemoveNode(display)
+
+
+def _nodes(scene) -> list:
+    collection = scene.GetNodes()
+    return [collection.GetItemAsObject(i) for i in range(collection.GetNumberOfItems())]
