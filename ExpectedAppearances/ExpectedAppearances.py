@@ -79,6 +79,11 @@ class TrainingPreset(_Choice):
     PAPER = "paper"
 
 
+class StudyProtocols(_Choice):
+    BOTH = "strict,loto"
+    STRICT = "strict"
+
+
 class WhenClosing(_Choice):
     ASK = "ask"
     DETACH = "detach"
@@ -97,6 +102,10 @@ CHOICE_LABELS = {
         "QUICK": "quick: for a processor",
         "BEST": "best: for a graphics card",
         "PAPER": "paper: for comparison only",
+    },
+    "StudyProtocols": {
+        "BOTH": "unseen textures: at unseen and at seen poses",
+        "STRICT": "unseen textures at unseen poses: half the time",
     },
     "WhenClosing": {
         "ASK": "ask (on quitting, work goes on)",
@@ -149,6 +158,7 @@ class ExpectedAppearancesParameterNode:
     device: str = "auto"  # or "cpu", or "cuda:N"
     minutes: Annotated[float, WithinRange(0.1, 10000)] = 26.0
 
+    studyProtocols: StudyProtocols = StudyProtocols.BOTH
     addLimitMm: Annotated[float, WithinRange(0.1, 100)] = 3.0
     accuracyLimitPercent: Annotated[float, WithinRange(0, 100)] = 80.0
     acceptedLimitPercent: Annotated[float, WithinRange(0, 100)] = 50.0

@@ -95,6 +95,7 @@ class ExpectedAppearancesLiveParameterNode:
     rateHz: Annotated[float, WithinRange(0.1, 100)] = 25.0
     longestPx: Annotated[int, WithinRange(256, 4096)] = 960
     staleMs: Annotated[int, WithinRange(50, 60000)] = 500
+    steady: bool = False
     outline: bool = True
     fill: bool = True
     fillOpacity: Annotated[float, WithinRange(0, 1)] = 0.35

@@ -23,6 +23,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/augmentation/impostors.py
   ExpectedAppearancesLib/augmentation/microscope.py
   ExpectedAppearancesLib/augmentation/surroundings.py
+  ExpectedAppearancesLib/cancelling.py
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py
@@ -58,6 +59,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/study.py
   ExpectedAppearancesLib/evaluation/study_figures.py
   ExpectedAppearancesLib/evaluation/study_folds.py
+  ExpectedAppearancesLib/evaluation/study_frames.py
   ExpectedAppearancesLib/evaluation/study_report.py
   ExpectedAppearancesLib/evaluation/verdict.py
   ExpectedAppearancesLib/executor.py
@@ -78,6 +80,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/live/recording.py
   ExpectedAppearancesLib/live/session.py
   ExpectedAppearancesLib/live/sources.py
+  ExpectedAppearancesLib/live/steady.py
   ExpectedAppearancesLib/live/trust.py
   ExpectedAppearancesLib/live/worker.py
   ExpectedAppearancesLib/masks/__init__.py
@@ -108,6 +111,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/live_scene.py
   ExpectedAppearancesLib/mrml/live_stream.py
   ExpectedAppearancesLib/mrml/live_views.py
+  ExpectedAppearancesLib/mrml/mri.py
   ExpectedAppearancesLib/mrml/planning.py
   ExpectedAppearancesLib/mrml/planning_adopt.py
   ExpectedAppearancesLib/mrml/planning_session.py
@@ -117,6 +121,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/poses/sampling.py
   ExpectedAppearancesLib/registration/__init__.py
   ExpectedAppearancesLib/registration/confidence.py
+  ExpectedAppearancesLib/registration/contrast.py
   ExpectedAppearancesLib/registration/covariance.py
   ExpectedAppearancesLib/registration/decoding.py
   ExpectedAppearancesLib/registration/footage.py
@@ -144,6 +149,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
   ExpectedAppearancesLib/textures/proposal.py
+  ExpectedAppearancesLib/textures/thumbnails.py
   ExpectedAppearancesLib/widgets/__init__.py
   ExpectedAppearancesLib/widgets/labels.py
   ExpectedAppearancesLib/widgets/live_align.py
@@ -167,6 +173,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/widgets/planning_run.py
   ExpectedAppearancesLib/widgets/planning_section.py
   ExpectedAppearancesLib/widgets/planning_selftest.py
+  ExpectedAppearancesLib/widgets/planning_selftest_tools.py
   ExpectedAppearancesLib/widgets/planning_textures.py
   ExpectedAppearancesLib/widgets/planning_training.py
   ExpectedAppearancesLib/widgets/planning_validation.py

@@ -89,7 +89,12 @@ def test_evaluate_writes_everything_and_the_figures_are_right(case, known, tmp_p
     assert camera == CAMERA and [frame.style for frame in predicted] == [STYLES[i % 2] for i in range(6)]
     assert predicted[3].image == read_poses(known)[1][3].image and predicted[3].extra["errors"]["add_mm"] == 3
     assert [frame.accepted for frame in predicted] == [True] * 4 + [False] * 2
-    for name in ("curves.png", "styles.png", "overlays.png"):
+    # All confidences are 0.5; 0, 1 and 2 mm are below 3 mm.
+    assert result["add_below_3mm"] == pytest.approx(3 / 6) and result["accepted_only"]["add_below_3mm"] == 0.75
+    assert result["reliability"]["bins"] == [
+        {"from": 0.5, "to": 0.6, "frames": 6, "confidence": 0.5, "add_below_3mm": 0.5}
+    ]
+    for name in ("curves.png", "styles.png", "overlays.png", "reliability.png"):
         assert files.read_image_rgb(out / name).std() > 5
     assert len(list((out / "overlays").glob("*.png"))) == 6
     assert steps == sorted(steps) and steps[-1] == 1.0
@@ -118,7 +123,7 @@ def test_report_is_one_file_with_escaped_names_and_embedded_figures(case, known,
     known.write_text(json.dumps(values))
     result = evaluate(case, known, tmp_path / "out", predictor=ShiftedPredictor(known)).metrics
     html = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert html.count("data:image/") == 3 and 'src="http' not in html
+    assert html.count("data:image/") == 4 and 'src="http' not in html
     assert "&lt;b&gt;day" in html and "<b>day" not in html
     assert "ADD 2.00 mm" in headline(result) and headline(result).split(":")[0] in html
     assert "2.00" in text_table(result).splitlines()[1]

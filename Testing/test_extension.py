@@ -235,7 +235,14 @@ def test_the_planning_panel_has_no_text_field_and_explains_what_is_chosen():
 
 def test_buttons_start_disabled_where_something_must_be_chosen_first():
     enabled = {w.get("name"): w.findtext("property[@name='enabled']/bool") for w in ui_root(MODULE).iter("widget")}
-    for name in ("saveCaseButton", "renderButton", "appearancesStart", "trainingStart", "showFiguresButton"):
+    for name in (
+        "saveCaseButton",
+        "renderButton",
+        "appearancesStart",
+        "trainingStart",
+        "studyStart",
+        "showFiguresButton",
+    ):
         assert enabled[name] == "false", name
 
 
@@ -266,6 +273,12 @@ import ExpectedAppearances as module
 logic = module.ExpectedAppearancesLogic()
 from ExpectedAppearancesLib.widgets.planning_panel import PlanningPanel
 panel = PlanningPanel(MagicMock(), logic.session, MagicMock())
+parameters = module.ExpectedAppearancesParameterNode()
+for name in ("vesselsNode", "cortexModel", "mriVolume", "craniotomyNode"):
+    setattr(parameters, name, None)
+panel.set_parameters(parameters, lambda: None)
+panel.enter()
+assert all(panel.steps[name].text for name in panel.sections), panel.steps
 heavy = ("torch", "cv2", "onnxruntime", "skimage", "scipy", "matplotlib")
 print([name for name in heavy if name in sys.modules], len(panel.sections))
 """

@@ -10,90 +10,26 @@ import numpy as np
 import pytest
 
 from ExpectedAppearancesLib import files
-from ExpectedAppearancesLib.demo.phantom import CAMERA, PhantomPainter, covered_frame, make_phantom
+from ExpectedAppearancesLib.demo.phantom import covered_frame, make_phantom
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.evaluation.metrics import add_mm
-from ExpectedAppearancesLib.live.choice import Choice, SourceKind
+from ExpectedAppearancesLib.live.choice import SourceKind
 from ExpectedAppearancesLib.live.estimator import open_model
 from ExpectedAppearancesLib.live.trust import Sight
-from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
+from ExpectedAppearancesLib.registration.poses_file import write_poses
 
 slicer = pytest.importorskip("slicer")
 
+from live_cases import SMALL, add_of, camera_to_ras_of, choice_of, node_with, send, shown_pixels, wait_for  # noqa: E402
 from mrml_views import SliceView, ThreeDView, new_application  # noqa: E402
 
-from ExpectedAppearancesLib.mrml import live_record, live_views  # noqa: E402
+from ExpectedAppearancesLib.mrml import live_views  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_views import LiveViews  # noqa: E402
-
-SMALL = CAMERA.resized(320, 240)
-
-
-@pytest.fixture(scope="module")
-def phantom(tmp_path_factory):
-    return make_phantom(tmp_path_factory.mktemp("phantom") / "case")
-
-
-@pytest.fixture(scope="module")
-def model(phantom):
-    return open_model(phantom.case)
-
-
-@pytest.fixture(scope="module")
-def frames(phantom):
-    """Twelve poses and their frames; from one to the next the camera moves by centimetres."""
-    poses = [phantom.pose(i / 12) for i in range(12)]
-    with PhantomPainter(phantom, SMALL) as painter:
-        return poses, [painter.paint(pose) for pose in poses]
 
 
 @pytest.fixture
 def application():
     return new_application()
-
-
-def node_with(scene, image):
-    """A vector volume as an OpenIGTLink connector makes it: no geometry, pixels only."""
-    node = scene.AddNewNodeByClass("vtkMRMLVectorVolumeNode", "Stream")
-    send(node, image)
-    return node
-
-
-def send(node, image):
-    from ExpectedAppearancesLib.mrml.live_scene import _set_image
-
-    _set_image(node, image)
-
-
-def choice_of(phantom, **values) -> Choice:
-    return Choice(**({"case_path": str(phantom.case.folder), "kind": SourceKind.NODE, "node_name": "Stream"} | values))
-
-
-def wait_for(controller, condition, timeout_s=60.0):
-    end = time.monotonic() + timeout_s
-    while time.monotonic() < end:
-        status = controller.tick(0.005)
-        if condition(status):
-            return status
-    raise AssertionError(f"did not happen: {controller.status}")
-
-
-def add_of(phantom, true, predicted) -> float:
-    return float(add_mm(phantom.case.vessels.vertices_mm, true[None], predicted[None])[0])
-
-
-def camera_to_ras_of(node) -> np.ndarray:
-    from vtk import vtkMatrix4x4
-
-    matrix = vtkMatrix4x4()
-    node.GetMatrixTransformToParent(matrix)
-    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
-
-
-def shown_pixels(live) -> np.ndarray:
-    from ExpectedAppearancesLib.mrml.live_stream import pixels_of
-
-    return pixels_of(live.frame.GetImageData())
 
 
 def test_three_hundred_frames_each_with_its_own_pose_and_nothing_left_over(application, phantom, model, frames):
@@ -313,119 +249,6 @@ def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(app
     assert scene.GetNumberOfNodes() == after_close
 
 
-def record(controller, scene, phantom, model, images):
-    stream = node_with(scene, images[0])
-    controller.start(choice_of(phantom, stale_s=60), model=model)
-    wait_for(controller, lambda s: s.new)
-    controller.start_recording()
-    poses = []
-    for image in images:
-        send(stream, image)
-        prediction = wait_for(controller, lambda s: s.new).result.prediction
-        poses.append(prediction)
-    controller.stop()
-    browser = live_record.recordings(scene)[-1]
-    return browser, poses
-
-
-def test_replay_of_a_saved_scene_gives_the_same_frames_and_poses(application, phantom, model, frames, tmp_path):
-    scene, _logic = application
-    images = [frames[1][0], frames[1][5], covered_frame(1, SMALL), frames[1][9]]
-    controller = LiveController(scene)
-    _browser, predicted = record(controller, scene, phantom, model, images)
-    from ExpectedAppearancesLib.mrml.scene import write_bundle
-
-    write_bundle(scene, tmp_path / "recorded.mrb")
-    controller.close()
-
-    import zipfile
-
-    with zipfile.ZipFile(tmp_path / "recorded.mrb") as bundle:
-        bundle.extractall(tmp_path / "unpacked")
-    loaded, logic_of_loaded = new_application()
-    loaded.SetURL(str(next((tmp_path / "unpacked").rglob("*.mrml"))))
-    assert loaded.Connect()
-    again = LiveController(loaded)
-    (browser,) = live_record.recordings(loaded)
-    assert browser.GetNumberOfItems() == 4
-    # Files keep no attributes of what is recorded, and Slicer copies that onto the nodes as soon as it has loaded.
-    played_into = [browser.GetProxyNode(live_record._sequence(browser, role)) for role in ("frame", "transform")]
-    for node in played_into:
-        node.RemoveAttribute("ExpectedAppearances.Live")
-    again.open_case(phantom.case.folder)
-    assert [again.live.frame, again.live.transform] == played_into
-    for i in (0, 1, 2, 3, 1):
-        browser.SetSelectedItemNumber(i)
-        logic_of_loaded.sequences.UpdateProxyNodesFromSequences(browser)
-        status = again.replay(browser)
-        np.testing.assert_array_equal(shown_pixels(again.live), images[i])
-        accepted = predicted[i].accepted
-        assert status.verdict.shows_overlay == accepted == again.live.overlay_visible
-        assert status.confidence == pytest.approx(predicted[i].confidence)
-        if accepted:
-            pose = predicted[i].camera_from_world
-            np.testing.assert_allclose(status.result.prediction.camera_from_world, pose, atol=1e-12)
-            expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(pose)
-            np.testing.assert_allclose(camera_to_ras_of(again.live.transform), expected, atol=1e-6)
-    again.close()
-    assert live_record.recordings(loaded)
-
-
-def test_replay_shows_its_own_frame_after_the_session_went_on(application, phantom, model, frames):
-    """Recording ends, the session does not: the frame it leaves must not be shown with the recorded pose."""
-    scene, _logic = application
-    stream = node_with(scene, frames[1][0])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), model=model)
-    wait_for(controller, lambda s: s.new)
-    controller.start_recording()
-    send(stream, frames[1][3])
-    pose = wait_for(controller, lambda s: s.new).result.prediction.camera_from_world
-    browser = controller.stop_recording()
-    send(stream, frames[1][8])
-    wait_for(controller, lambda s: s.new)
-    controller.stop()
-    for _again in range(2):
-        assert controller.replay(browser).verdict.shows_overlay
-        np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][3])
-        expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(pose)
-        np.testing.assert_allclose(camera_to_ras_of(controller.live.transform), expected, atol=1e-6)
-        controller.start(choice_of(phantom, stale_s=60), model=model)  # its frames must not get into the recording
-        send(stream, frames[1][6])
-        wait_for(controller, lambda s: s.new)
-        controller.stop()
-    controller.close()
-
-
-def test_a_loaded_scene_shows_its_last_frame_without_overlay(application, phantom, model, frames):
-    scene, _logic = application
-    node_with(scene, frames[1][3])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
-    wait_for(controller, lambda s: s.new)
-    kept = controller.live
-    pixels, matrix, camera = shown_pixels(kept), camera_to_ras_of(kept.transform), kept.camera
-    controller.forget_scene()  # as after loading: the nodes are there, the session is not
-    again = LiveController(scene)
-    assert again.restore(phantom.case.folder, camera)
-    np.testing.assert_array_equal(shown_pixels(again.live), pixels)
-    np.testing.assert_allclose(again.live.camera_to_ras, matrix)
-    assert not again.live.overlay_visible and again.live.plane_mm == pytest.approx(kept.plane_mm)
-    again.close()
-    assert not LiveController(scene).restore(phantom.case.folder, camera)
-
-
-def test_a_recording_of_another_case_shows_no_overlay(application, phantom, model, frames, tmp_path):
-    scene, _logic = application
-    controller = LiveController(scene)
-    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
-    other = make_phantom(tmp_path / "other", seed=1)
-    controller.open_case(other.case.folder)
-    assert controller.replay(browser).verdict.sight is Sight.OTHER_CASE
-    assert not controller.live.overlay_visible
-    controller.close()
-
-
 def test_a_model_of_another_case_is_refused(phantom, tmp_path):
     import shutil
 
@@ -434,123 +257,6 @@ def test_a_model_of_another_case_is_refused(phantom, tmp_path):
     shutil.copytree(phantom.case.model_folder, other.case.model_folder)
     with pytest.raises(InputError, match="vessels of another case"):
         open_model(other.case)
-
-
-def test_export_gives_poses_images_and_transforms(application, phantom, model, frames, tmp_path):
-    scene, _logic = application
-    controller = LiveController(scene)
-    images = [frames[1][0], covered_frame(1, SMALL), frames[1][9]]
-    browser, predicted = record(controller, scene, phantom, model, images)
-    path = live_record.export(browser, tmp_path / "out", phantom.case.space)
-    camera, exported = read_poses(path)
-    assert camera == SMALL or (camera.width, camera.height) == (320, 240)
-    for i, frame in enumerate(exported):
-        np.testing.assert_array_equal(files.read_image_rgb(frame.image), images[i])
-        assert frame.accepted == predicted[i].accepted
-        transform = tmp_path / "out" / "transforms" / f"{i:05d}.tfm"
-        assert transform.is_file() == (predicted[i].camera_from_world is not None)
-        if not frame.accepted:
-            continue
-        np.testing.assert_allclose(frame.camera_from_world, predicted[i].camera_from_world, atol=1e-12)
-        storage, node = slicer.vtkMRMLTransformStorageNode(), slicer.vtkMRMLLinearTransformNode()
-        storage.SetFileName(str(transform))
-        assert storage.ReadData(node)
-        expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(frame.camera_from_world)
-        np.testing.assert_allclose(camera_to_ras_of(node), expected, atol=1e-6)
-    times = [frame.extra["time_s"] for frame in exported]
-    assert times == sorted(times) and times[0] == 0
-    controller.close()
-
-
-def test_recording_ends_at_its_limit(application, phantom, model, frames):
-    scene, _logic = application
-    stream = node_with(scene, frames[1][0])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), model=model)
-    wait_for(controller, lambda s: s.new)
-    controller.start_recording(limit_mb=2.5 * 320 * 240 * 3 / 2**20)
-    for i in range(6):
-        send(stream, frames[1][i])
-        wait_for(controller, lambda s: s.new)
-    assert controller.recorder.full and controller.recorder.frames == 3
-    assert controller.stop_recording().GetNumberOfItems() == 3
-    controller.close()
-
-
-def test_alignment_by_handles_sliders_and_landmarks_gives_the_true_pose(application, phantom, model, frames):
-    scene, _logic = application
-    true = frames[0][2]
-    node_with(scene, frames[1][2])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
-    wait_for(controller, lambda s: s.new)
-    before = scene.GetNumberOfNodes()
-    alignment = controller.begin_alignment()
-    start = alignment.camera_from_world
-    # Sliders: 5 mm to the right moves the vessels 5 mm along the camera's x.
-    controller.nudge(np.array([5.0, 0, 0]), np.zeros(3), start)
-    assert add_of(phantom, start, alignment.camera_from_world) == pytest.approx(5.0, abs=1e-6)
-    controller.tick()
-    difference = controller.difference()
-    assert difference.add_mm == pytest.approx(5.0, abs=1e-3)
-    assert controller.live.lines["truth"].GetDisplayNode().GetVisibility()
-    shift, turn = controller.nudges(start)
-    np.testing.assert_allclose(shift, [5, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(turn, 0, atol=1e-6)
-    # Handles: the user turns the transform in the scene; the vessels hang under it.
-    import vtk
-
-    turned = vtk.vtkTransform()
-    turned.Translate(3, -2, 1)
-    turned.RotateZ(4)
-    alignment.handles.SetMatrixTransformToParent(turned.GetMatrix())
-    moved = camera_to_ras_of(alignment.handles)
-    ras = np.diag([-1.0, -1.0, 1.0, 1.0])
-    np.testing.assert_allclose(alignment.camera_from_world, start @ ras @ moved @ ras, atol=1e-9)
-    # Landmarks picked where the true pose has them.
-    from ExpectedAppearancesLib.mrml.live_align import add_landmark_lists
-
-    in_frame, on_mesh = add_landmark_lists(controller.live)
-    vertices = phantom.case.vessels.vertices_mm[:: len(phantom.case.vessels.vertices_mm) // 6][:6]
-    in_camera = vertices @ true[:3, :3].T + true[:3, 3]
-    for point, seen in zip(vertices, in_camera):
-        on_mesh.AddControlPoint(*(point * [-1, -1, 1]))
-        index = in_frame.AddControlPoint(0, 0, 0)
-        in_frame.SetNthControlPointPosition(index, *(seen * controller.live.plane_mm / seen[2]))
-    assert controller.align_to_landmarks(in_frame, on_mesh) < 0.01
-    assert add_of(phantom, true, alignment.camera_from_world) < 0.01
-    controller.finish_alignment(keep=True)
-    assert add_of(phantom, true, controller.truth) < 0.01
-    assert controller.difference().add_mm < 0.3
-    for node in (in_frame, on_mesh):
-        scene.RemoveNode(node)
-    assert controller.live.models["Vessels"].GetParentTransformNode() is None
-    assert scene.GetNumberOfNodes() <= before + 2  # the landmark lists' display nodes
-    controller.close()
-
-
-def test_true_poses_are_collected_for_evaluation(application, phantom, model, frames, tmp_path):
-    scene, _logic = application
-    stream = node_with(scene, frames[1][2])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
-    wait_for(controller, lambda s: s.new)
-    with pytest.raises(InputError, match="align the vessels"):
-        controller.save_truth(tmp_path)
-    for i in (2, 3):
-        controller.begin_alignment().set_pose(frames[0][i])
-        controller.finish_alignment()
-        path = controller.save_truth(tmp_path)
-        controller.next_frame()
-        send(stream, frames[1][3])
-        wait_for(controller, lambda s: s.new)
-        assert controller.truth is None
-    _camera, saved = read_poses(path)
-    assert len(saved) == 2
-    for i, frame in zip((2, 3), saved):
-        np.testing.assert_allclose(frame.camera_from_world, frames[0][i], atol=1e-9)
-        np.testing.assert_array_equal(files.read_image_rgb(frame.image), frames[1][i])
-    controller.close()
 
 
 def test_frame_pose_and_overlay_change_while_nothing_is_drawn(application, phantom, model, frames):

@@ -155,3 +155,19 @@ def test_mean_pose_lies_in_the_middle():
     np.testing.assert_allclose(metrics.mean_pose(CUBE, both), TRUE, atol=1e-9)
     both = [moved_in_camera((0, 0, 8)), moved_in_camera((0, 2, 0))]
     np.testing.assert_allclose(metrics.mean_pose(CUBE, both), moved_in_camera((0, 1, 4)), atol=1e-9)
+
+
+def test_reliability_of_confidences_that_mean_what_they_say_and_of_boasts():
+    rng = np.random.default_rng(0)
+    confidence = rng.uniform(0, 1, 20_000)
+    good = rng.uniform(size=20_000) < confidence
+    vertices = np.zeros((1, 3))
+    poses = [pose(translation=(0 if g else 5, 0, 100)) for g in good]
+    errors = metrics.frame_errors(vertices, [pose(translation=(0, 0, 100))] * 20_000, poses)
+    honest = metrics.reliability(confidence, errors)
+    assert honest["expected_calibration_error"] < 0.02 and sum(row["frames"] for row in honest["bins"]) == 20_000
+    assert all(abs(row["confidence"] - row["add_below_3mm"]) < 0.05 for row in honest["bins"])
+    boasts = metrics.reliability(np.ones(20_000), errors)
+    (row,) = boasts["bins"]
+    assert row["from"] == 0.9 and row["add_below_3mm"] == pytest.approx(good.mean())
+    assert boasts["expected_calibration_error"] == pytest.approx(1 - good.mean())

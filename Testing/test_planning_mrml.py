@@ -3,72 +3,28 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
-from enum import Enum
-from types import SimpleNamespace
 
 import cases
 import cv2
 import numpy as np
 import pytest
 
-from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.case.meshes import Mesh, read_mesh
-from ExpectedAppearancesLib.case.steps import StepState
+from ExpectedAppearancesLib.case.meshes import read_mesh
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.geometry.camera import Camera, read_camera
+from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.poses.craniotomy import Craniotomy, find_craniotomy
 
 slicer = pytest.importorskip("slicer")
 import vtk  # noqa: E402 (after the skip)
+from planning_scene import LPS, add_model, add_transform, turned  # noqa: E402
 from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import charts, labelling, planning  # noqa: E402
-from ExpectedAppearancesLib.mrml.planning_adopt import adopt  # noqa: E402
-from ExpectedAppearancesLib.mrml.planning_session import PlanningSession, write_plain_mesh  # noqa: E402
+from ExpectedAppearancesLib.mrml.planning_session import write_plain_mesh  # noqa: E402
 
-LPS = np.array([-1.0, -1.0, 1.0])
 POSE = look_at(np.array([25.0, -18.0, 90.0]), np.array([1.0, 0.5, -2.0]), np.array([0.2, 1.0, 0.0]))
-
-
-@pytest.fixture
-def scene():
-    scene = slicer.vtkMRMLScene()
-    logic = slicer.vtkSlicerApplicationLogic()
-    logic.SetMRMLScene(scene)
-    logic.GetColorLogic().SetMRMLScene(scene)
-    logic.GetColorLogic().AddDefaultColorNodes()
-    logic.SetSliceLogics(vtk.vtkCollection())
-    segmentations = slicer.vtkSlicerSegmentationsModuleLogic()  # registers what makes surfaces of segments
-    segmentations.SetMRMLScene(scene)
-    scene.keep_alive = (logic, segmentations)
-    return scene
-
-
-def add_model(scene, mesh: Mesh, name="Vessels"):
-    """Model node with the mesh's vertices as RAS."""
-    node = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
-    node.SetAndObservePolyData(mesh.to_polydata())
-    return node
-
-
-def add_transform(scene, matrix: np.ndarray, parent=None):
-    node = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode")
-    result = vtk.vtkMatrix4x4()
-    result.DeepCopy(matrix.ravel().tolist())
-    node.SetMatrixTransformToParent(result)
-    if parent:
-        node.SetAndObserveTransformNodeID(parent.GetID())
-    return node
-
-
-def turned() -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0]
-    matrix[:3, 3] = 12.0, -7.0, 30.0
-    return matrix
 
 
 @pytest.mark.parametrize("space", ["LPS", "RAS"])
@@ -274,169 +230,6 @@ def test_plots_are_found_again_and_filled_anew(scene):
     series = {chart.GetNthPlotSeriesNode(i).GetName(): chart.GetNthPlotSeriesNode(i) for i in range(2)}
     rows = {name: node.GetTableNode().GetNumberOfRows() for name, node in series.items()}
     assert rows == {"Validation ADD (mm)": 2, "Loss": 2}
-
-
-class Source(Enum):
-    FILE, VIEW = "file", "view"
-
-
-class Where(Enum):
-    FITTED, MARKED, RECORDED = "fitted", "marked", "recorded"
-
-
-class How(Enum):
-    SURFACE, IMAGE = "surface", "image"
-
-
-class Preset(Enum):
-    QUICK, BEST, PAPER = "quick", "best", "paper"
-
-
-def parameters(**values) -> SimpleNamespace:
-    usual = dict(vesselsNode=None, vesselsSegmentId="", cortexModel=None, casePath="", cameraSource=Source.FILE)
-    usual |= dict(calibrationPath="", fieldOfViewMm=40.0, viewedAtMm=300.0, imageWidthPx=192, imageHeightPx=108)
-    usual |= dict(craniotomySource=Where.FITTED, craniotomyNode=None, tiltMaxDeg=50.0, rollMaxDeg=45.0)
-    usual |= dict(distanceAuto=True, nearestMm=80.0, farthestMm=140.0, lateralAuto=True, lateralMm=3.0)
-    usual |= dict(inViewPercent=60.0, poseCount=4, seed=0, texturesPath="", method=How.SURFACE, sizePx=384)
-    usual |= dict(iterations=50, preset=Preset.QUICK, minutes=26.0, addLimitMm=3.0, acceptedLimitPercent=50.0)
-    return SimpleNamespace(**(usual | dict(accuracyLimitPercent=80.0) | values))
-
-
-@pytest.fixture
-def planned(scene, tmp_path):
-    """Session and parameters with models chosen, under a transform; and the folder of their files."""
-    paths = cases.write_inputs(tmp_path)
-    parent = add_transform(scene, turned())
-    nodes = [add_model(scene, cases.vessels()), add_model(scene, cases.dome(), "Cortex")]
-    for node in nodes:
-        node.SetAndObserveTransformNodeID(parent.GetID())
-    return PlanningSession(), parameters(
-        vesselsNode=nodes[0], cortexModel=nodes[1], calibrationPath=str(paths["camera.json"])
-    )
-
-
-def save(session, p, folder) -> Case:
-    """What the command `new` does with the exported inputs."""
-    options = session.export_inputs(p, folder / "exported")
-    values = dict(zip(options[::2], options[1::2]))
-    return Case.create(folder / "case", values["--vessels"], values["--cortex"], values["--camera"], values["--space"])
-
-
-def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
-    session, p = planned
-    assert session.steps(p)["case"].state is StepState.MISSING
-    p.casePath = str(tmp_path / "case")
-    assert session.steps(p)["case"].state is StepState.READY
-    case = save(session, p, tmp_path)
-    steps = session.steps(p)
-    assert (steps["case"].state, steps["microscope"].state) == (StepState.DONE, StepState.DONE)
-    expected_ras = cases.vessels().vertices_mm @ turned()[:3, :3].T + turned()[:3, 3]
-    np.testing.assert_allclose(case.vessels.vertices_mm * LPS, expected_ras, atol=1e-4)
-
-    p.vesselsNode.SetAndObserveTransformNodeID(None)
-    assert session.changed_models(p) == ("vessel model",)
-    assert session.steps(p)["case"].state is StepState.STALE
-
-    count = scene.GetNumberOfNodesByClass("vtkMRMLModelNode")
-    for _repeat in range(2):
-        assert adopt(session, p, scene) is not None
-        assert session.steps(p)["case"].state is StepState.DONE
-        assert scene.GetNumberOfNodesByClass("vtkMRMLModelNode") == count + 2
-
-
-def test_rendered_poses_are_those_that_were_planned(planned, tmp_path):
-    """The options for `render`, parsed and run by it, leave nothing outdated; another tilt does."""
-    from ExpectedAppearancesLib import cli
-
-    session, p = planned
-    p.casePath = str(tmp_path / "case")
-    p.lateralAuto, p.lateralMm = False, 0.0
-    case = save(session, p, tmp_path)
-    assert cli.main(["render", str(case.folder), *session.render_arguments(p)]) == 0
-    assert session.steps(p)["poses"].state is StepState.DONE
-    p.tiltMaxDeg = 30.0
-    assert "the tilt" in session.steps(p)["poses"].text
-    # Opening the case takes over what it was rendered with.
-    other = parameters(casePath=p.casePath, poseCount=99)
-    scene = p.vesselsNode.GetScene()
-    adopt(session, other, scene)
-    assert (other.poseCount, other.tiltMaxDeg, other.lateralAuto, other.lateralMm) == (4, 50.0, False, 0.0)
-    assert other.craniotomySource is Where.FITTED
-    assert session.steps(other)["poses"].state is StepState.DONE
-
-
-def test_a_craniotomy_that_was_marked_is_kept_when_the_case_is_opened(scene, planned, tmp_path):
-    from ExpectedAppearancesLib import cli
-
-    session, p = planned
-    p.casePath = str(tmp_path / "case")
-    case = save(session, p, tmp_path)
-    point = scene.AddNewNodeByClass("vtkMRMLMarkupsFiducialNode", "Craniotomy")
-    p.craniotomySource, p.craniotomyNode = Where.MARKED, point
-    assert "click on the cortex" in session.steps(p)["poses"].text
-    centre = case.vessels.centroid_mm + np.array([2.0, 0.0, 0.0])
-    point.AddControlPoint(*(centre * LPS))
-    first = session.sampler(p)
-    assert cli.main(["render", str(case.folder), *session.render_arguments(p)]) == 0
-    assert session.steps(p)["poses"].state is StepState.DONE
-    centre[0] += 1.0
-    point.SetNthControlPointPosition(0, *(centre * LPS))
-    assert session.sampler(p) is not first
-    assert "craniotomy" in session.steps(p)["poses"].text
-    other = parameters(casePath=p.casePath)
-    adopt(session, other, scene)
-    assert other.craniotomySource is Where.RECORDED
-    assert session.steps(other)["poses"].state is StepState.DONE
-
-
-def test_all_problems_of_a_case_are_told_at_once(planned, tmp_path):
-    session, p = planned
-    p.calibrationPath = str(tmp_path / "absent.json")
-    p.vesselsNode.SetAndObservePolyData(vtk.vtkPolyData())
-    found = "\n".join(session.problems_of_new_case(p, ""))
-    for words in ("choose one with New", "holds no surface", "absent.json"):
-        assert words in found
-    assert session.steps(p)["poses"].state is StepState.MISSING
-
-
-def test_textures_are_compared_with_what_was_synthesised(planned, tmp_path):
-    from ExpectedAppearancesLib.textures.library import read_texture, shipped_textures_folder
-
-    session, p = planned
-    files = session.texture_files(p)
-    assert len(files) == 10
-    assert set(session.chosen(p).textures.values()) == {""}  # not read yet
-    name, (version, image, labels) = next(iter(files.items()))
-    texture = read_texture(name, image, labels)
-    assert texture.sha256 != replace(texture, labels=np.maximum(texture.labels, 1)[::-1]).sha256
-    session.texture_digests[version] = texture.sha256
-    assert session.chosen(p).textures[name] == texture.sha256
-    p.texturesPath = str(tmp_path / "gone")
-    assert "no longer there" in session.steps(p)["textures"].text
-    assert session.textures_folder(parameters()) == shipped_textures_folder()
-
-
-def test_microscope_from_its_field_of_view(planned):
-    session, p = planned
-    p.cameraSource = Source.VIEW
-    camera = session.camera(p)
-    assert camera.width / camera.fx * 300.0 == pytest.approx(40.0)
-    assert read_camera(p.calibrationPath) == session.camera(parameters(calibrationPath=p.calibrationPath))
-
-
-def test_the_session_loads_nothing_heavy():
-    """In a fresh interpreter: what the panel imports when it is opened."""
-    import subprocess
-
-    code = (
-        "import sys; from ExpectedAppearancesLib.mrml import planning_session, planning_adopt, labelling, charts; "
-        "from ExpectedAppearancesLib.runs import runner, closing, dependencies; "
-        "from ExpectedAppearancesLib.model.presets import PRESETS; from ExpectedAppearancesLib.masks import stage; "
-        "session = planning_session.PlanningSession(); "
-        "print([m for m in ('torch', 'cv2', 'onnxruntime', 'skimage', 'scipy', 'matplotlib') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
 KEEP_THE_CONTEXT = """

@@ -13,7 +13,7 @@ from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.appearances.projection import SurfacePainter, parenchyma_plate
 from ExpectedAppearancesLib.appearances.store import Appearance
 from ExpectedAppearancesLib.augmentation.impostors import impostor
-from ExpectedAppearancesLib.augmentation.surroundings import fill_outside, opening
+from ExpectedAppearancesLib.augmentation.surroundings import continue_tissue, fill_outside, opening
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.masks.labels import PARENCHYMA, VESSELS
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
@@ -143,3 +143,30 @@ def test_impostors_are_not_the_image():
         other = impostor(image, np.random.default_rng(seed))
         assert other.shape == image.shape and other.dtype == np.uint8
         assert min(np.abs(other - t).mean() for t in turns) > 3
+
+
+def test_tissue_goes_on_beyond_the_rim_without_a_seam_and_each_time_elsewhere(monkeypatch):
+    monkeypatch.setattr("ExpectedAppearancesLib.augmentation.surroundings.EVERYWHERE", 0.0)
+    rows, columns = np.mgrid[:96, :128]
+    inside = (np.hypot(rows - 48, columns - 60) < 25).astype(np.uint8)
+    tissue = np.full((96, 128, 3), (180, 90, 80), np.uint8)
+    tissue[columns[:, :] % 8 < 2] = (150, 60, 60)
+    seen = tissue * inside[..., None]
+    areas = []
+    for seed in range(12):
+        image, where = continue_tissue(seen.copy(), inside, np.random.default_rng(seed))
+        assert where[inside > 0].all()
+        assert image[where].min() > 50  # no black rim left between the old tissue and the new
+        deep = cv2.erode(inside, np.ones((9, 9))) > 0
+        np.testing.assert_array_equal(image[deep], seen[deep])
+        assert not image[~where & (inside == 0)].any()
+        areas.append(where.sum() / inside.sum())
+    assert min(areas) < 1.15 and max(areas) > 1.5
+
+
+def test_a_view_full_of_tissue_or_without_any_is_left_as_it_is():
+    image = np.full((32, 32, 3), 7, np.uint8)
+    for inside in (np.ones((32, 32), np.uint8), np.zeros((32, 32), np.uint8)):
+        same, where = continue_tissue(image.copy(), inside, np.random.default_rng(0))
+        np.testing.assert_array_equal(same, image)
+        np.testing.assert_array_equal(where, inside > 0)

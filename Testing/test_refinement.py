@@ -103,14 +103,14 @@ def test_a_sure_fit_moves_less_and_the_covariance_shrinks(seen):
 
 def test_jacobian_against_differences():
     rng = np.random.default_rng(0)
-    turned, position = rng.normal(0, 10, (5, 3)), np.array([1.0, 2.0, 90.0])
+    turned, position = rng.normal(0, 10, (3, 5)), np.array([[1.0], [2.0], [90.0]])
     focal = np.array([CAMERA.fx, CAMERA.fy])
 
     def pixels(step):
-        points = turned @ rotation_matrix(step[:3]).T + position + step[3:]
-        return points[:, :2] / points[:, 2:] * focal
+        points = rotation_matrix(step[:3]) @ turned + position + step[3:, None]
+        return points[:2] / points[2] * focal[:, None]
 
-    numeric = np.stack([(pixels(e) - pixels(-e)) / 2e-5 for e in 1e-5 * np.eye(6)], axis=-1)
+    numeric = np.stack([(pixels(e) - pixels(-e)) / 2e-5 for e in 1e-5 * np.eye(6)])
     np.testing.assert_allclose(projection_jacobian(turned, turned + position, focal), numeric, rtol=1e-5, atol=1e-5)
 
 

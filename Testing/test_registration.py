@@ -12,6 +12,7 @@ from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import geodesic_angle_rad, inverse, pose_from_rotation, transform
 from ExpectedAppearancesLib.model.encoding import PoseEncoding, fit_encoding, network_camera
 from ExpectedAppearancesLib.registration.confidence import calibrate, calibration_error
+from ExpectedAppearancesLib.registration.contrast import ContrastAligner
 from ExpectedAppearancesLib.registration.decoding import PlausibleView, cell_pixels, read_dense
 from ExpectedAppearancesLib.registration.pnp import fit_pose
 from ExpectedAppearancesLib.registration.predictor import Predictor, fitted_camera
@@ -126,14 +127,17 @@ def dense_output(true: np.ndarray, encoding: PoseEncoding, grid: int = 64) -> np
 def test_dense_output_is_read_in_the_right_pixels():
     true = pose(1)
     encoding = PoseEncoding(np.eye(3), CENTRE, 25.0, np.zeros(3), 1.0)
-    # No vessel is seen in this output, so nothing is refined.
-    aligner = VesselAligner(CENTRE + 5 * np.eye(3), np.array([[0, 1, 2]]), CAMERA)
-    reading = read_dense(dense_output(true, encoding), CAMERA, encoding, aligner)
+    # No vessel is seen in this output, nor in the black frame, so nothing is refined.
+    vessels = CENTRE + 5 * np.eye(3), np.array([[0, 1, 2]])
+    sharp = CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height)
+    given = np.zeros((sharp.height, sharp.width, 3), np.uint8), CAMERA, encoding
+    aligners = VesselAligner(*vessels, CAMERA), ContrastAligner(*vessels, sharp)
+    reading = read_dense(dense_output(true, encoding), *given, *aligners)
     np.testing.assert_allclose(reading.camera_from_world, true, atol=2e-3)
     assert np.isfinite(reading.evidence).all()
     nothing = dense_output(true, encoding)
     nothing[4] = -6
-    assert read_dense(nothing, CAMERA, encoding, aligner).camera_from_world is None
+    assert read_dense(nothing, *given, *aligners).camera_from_world is None
 
 
 def test_confidence_is_calibrated_and_its_threshold_keeps_bad_poses_out():

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from cases import camera, dome, vessels
@@ -6,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from ExpectedAppearancesLib.case.meshes import Mesh
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.pose import inverse, is_rigid
+from ExpectedAppearancesLib.poses import sampling
 from ExpectedAppearancesLib.poses.craniotomy import Craniotomy, disc_under_vessels, find_craniotomy
 from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
 
@@ -104,3 +106,11 @@ def test_all_impossible_ranges_are_reported_at_once():
     with pytest.raises(InputError) as error:
         sampler(tilt_max_deg=120, roll_max_deg=-1, working_distance_mm=(50, 40), lateral_offset_mm=-1)
     assert len(error.value.problems) == 4
+
+
+def test_turns_are_those_of_opencv():
+    rng = np.random.default_rng(3)
+    for angle in (0.0, 1e-9, 0.7, -2.9, np.pi):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        np.testing.assert_allclose(sampling._turn(axis, angle), cv2.Rodrigues(axis * angle)[0], atol=1e-12)

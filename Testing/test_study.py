@@ -149,7 +149,7 @@ def test_figures_of_both_protocols_are_those_computed_by_hand(studied):
 def test_report_is_one_file_with_its_pictures(studied):
     run(studied, replace(QUICK, protocols=("strict", "loto"), robustness=True, robustness_frames=3))
     html = (studied.out / "report.html").read_text(encoding="utf-8")
-    assert html.count("data:image/") == 5 and not re.search(r'src="(?!data:)', html)
+    assert html.count("data:image/") == 6 and not re.search(r'src="(?!data:)', html)
     assert "2.33" in html and "66.7" in html and "<details>" in html and "brain shift" in html
     robustness = study.read_study(studied.case)["robustness"]
     assert robustness["undisturbed"]["add_mm"]["mean"] == pytest.approx(7 / 3)

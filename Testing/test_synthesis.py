@@ -14,7 +14,6 @@ from ExpectedAppearancesLib.appearances.vgg import load_vgg
 from ExpectedAppearancesLib.appearances.workload import (
     BYTES_PER_PIXEL,
     bytes_per_image,
-    fine_and_coarse,
     images_at_once,
     operations_per_evaluation,
 )
@@ -275,32 +274,6 @@ def test_torchvision_weights_give_the_same_features(tmp_path, vgg):
     torch.testing.assert_close(loaded(bgr)[0][inner], expected[inner], rtol=2e-3, atol=5e-3)
 
 
-def test_half_the_size_first_gives_images_as_near_to_the_texture_for_less(vgg, monkeypatch):
-    """At 128 px and 10 iterations, 6 of them at half the size, against as many full-size ones for the same work."""
-    monkeypatch.setattr("ExpectedAppearancesLib.appearances.workload.LEAST_COARSE_PX", 64)
-    monkeypatch.setattr("ExpectedAppearancesLib.appearances.workload.FINE_SHARE", 0.4)
-    job = Job(label_map(128), texture("a", size=128), 1)
-    fine, coarse = fine_and_coarse(job.labels.shape, 10)
-    assert (fine, coarse) == (4, 6)
-    sizes = []
-    original = ClassGramLoss.value_and_gradient
-
-    def spy(self, images):
-        sizes.append(images.shape[-1])
-        return original(self, images)
-
-    monkeypatch.setattr(ClassGramLoss, "value_and_gradient", spy)
-    shares = []
-    (image,) = Synthesizer(vgg, CPU, 10).run([job], shares.append)
-    assert sizes == [64] * 7 + [128] * 5
-    assert shares == sorted(shares) and shares[-1] == pytest.approx(1.0)
-    measure = GramMeasure(vgg)
-    distance = sum(measure.distances(image, job.labels, job.texture).values())
-    monkeypatch.setattr("ExpectedAppearancesLib.appearances.synthesis.fine_and_coarse", lambda *_: (5, 0))
-    (full,) = Synthesizer(vgg, CPU, 5).run([job])
-    assert distance < sum(measure.distances(full, job.labels, job.texture).values())
-
-
 def test_the_measure_is_the_plain_loss_in_fp32_of_the_saved_image(vgg):
     rng = np.random.default_rng(0)
     image, labels, t = rng.integers(0, 256, (48, 48, 3), np.uint8), label_map(), texture()
@@ -318,15 +291,15 @@ def test_targets_are_made_once_for_a_texture_and_only_few_are_kept(vgg, monkeypa
     calls = []
     original = texture_grams
     monkeypatch.setattr(
-        "ExpectedAppearancesLib.appearances.synthesis.texture_grams", lambda *a: calls.append(1) or original(*a)
+        "ExpectedAppearancesLib.appearances.gram.texture_grams", lambda *a: calls.append(1) or original(*a)
     )
     synthesizer = Synthesizer(vgg, CPU, 1)
     for seed in range(3):
         synthesizer.run([Job(label_map(), texture("a"), seed)])
     assert len(calls) == 1
     for i in range(20):
-        synthesizer._target(texture(f"t{i}"), 32, 32)
-    assert len(synthesizer._targets) <= 8
+        synthesizer.targets.of(texture(f"t{i}"), 32, 32)
+    assert len(synthesizer.targets._kept) <= 4
 
 
 def test_operations_are_those_of_the_layers():

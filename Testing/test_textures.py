@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +11,15 @@ import pytest
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.textures import generate
-from ExpectedAppearancesLib.textures.library import Texture, read_library, shipped_textures_folder
+from ExpectedAppearancesLib.runs.environment import library_environment
+from ExpectedAppearancesLib.textures import generate, thumbnails
+from ExpectedAppearancesLib.textures.library import (
+    Texture,
+    list_textures,
+    read_library,
+    read_texture,
+    shipped_textures_folder,
+)
 
 CORTEX_TEXTURES = Path(__file__).parents[2] / "shared/data/cortex/textures"
 
@@ -160,3 +169,21 @@ def test_generate_writes_each_palette_for_the_given_seed(tmp_path, monkeypatch):
     textures = read_library(tmp_path)
     assert {texture.name for texture in textures} == set(generate.PALETTES)
     np.testing.assert_array_equal(textures[0].image, photo())
+
+
+def test_thumbnails_and_digests_are_made_by_a_process_of_its_own(tmp_path):
+    """As the planning panel asks for them: 3D Slicer's process must not load OpenCV while a run goes on."""
+    shipped = list_textures(shipped_textures_folder())
+    image, labels = shipped["apricot"]
+    folder = tmp_path / "Fälle"
+    thumbnails.ask_for(
+        folder, [("apricot", image, labels), ("bare", image, None), ("gone", tmp_path / "x.png", labels)]
+    )
+    assert thumbnails.answer(folder) == {}
+    command = [sys.executable, "-m", "ExpectedAppearancesLib.textures.thumbnails", str(folder)]
+    subprocess.run(command, check=True, env=library_environment())
+    made = thumbnails.answer(folder)
+    assert made["apricot"]["sha256"] == read_texture("apricot", image, labels).sha256
+    shown = files.read_image_rgb(made["apricot"]["thumbnail"])
+    assert shown.shape == (84, 84, 3) and (shown == thumbnails.OUTLINE_RGB).all(axis=2).any()
+    assert "label map" in made["bare"]["problem"] and "x.png" in made["gone"]["problem"]

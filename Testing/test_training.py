@@ -1,5 +1,10 @@
 import json
+import os
+import signal
+import subprocess
+import sys
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +16,7 @@ from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import projection, store
 from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.case.recorded import training_state
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.geometry.pose import transform
@@ -25,6 +31,7 @@ from ExpectedAppearancesLib.model.presets import PRESETS
 from ExpectedAppearancesLib.model.training import train_case
 from ExpectedAppearancesLib.registration.decoding import cell_pixels
 from ExpectedAppearancesLib.registration.predictor import Predictor
+from ExpectedAppearancesLib.runs.environment import library_environment
 
 CPU = torch.device("cpu")
 COLOURS = np.array([[0, 0, 0], [225, 170, 160], [60, 30, 200]], np.uint8)
@@ -245,6 +252,54 @@ def test_a_stopped_training_goes_on_from_its_checkpoint(trained, monkeypatch):
     figures = train_case(trained, preset, lambda *_: None, CPU, seed=9, method="surface")
     assert saves[:3] == [1, 2, 3] and figures["steps"] == 6
     assert threading.active_count() <= before + 1
+
+
+# A training that saves nothing on its own, and notes every step that it has done.
+STEPPER = """
+import sys
+from dataclasses import replace
+from ExpectedAppearancesLib.cli import main
+from ExpectedAppearancesLib.model import presets, training
+
+usual = training._Trainer._update_average
+
+def noted(self, step):
+    usual(self, step)
+    with open(sys.argv[2], "a") as stream:
+        print(step + 1, file=stream)
+
+if __name__ == "__main__":
+    training.CHECKPOINT_EVERY_S = 1e9
+    training._Trainer._update_average = noted
+    small = {"size_px": 64, "batch": 4, "fresh": 2, "validation_views": 6, "width": 0.4}
+    presets.PRESETS["quick"] = replace(presets.PRESETS["quick"], steps=10**6, validate_every=10**6, **small)
+    sys.exit(main(["train", sys.argv[1], "--device", "cpu", "--appearances", "surface", "--seed", "11"]))
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_cancelled_training_loses_no_step(case, tmp_path, number):
+    (tmp_path / "stepper.py").write_text(STEPPER)
+    path = case.model_folder / "checkpoint.safetensors"
+    path.unlink(missing_ok=True)
+
+    def steps() -> list[int]:
+        noted = tmp_path / "steps.txt"
+        return [int(line) for line in noted.read_text().split()] if noted.is_file() else []
+
+    for wanted in (5, 12):
+        process = subprocess.Popen(
+            [sys.executable, str(tmp_path / "stepper.py"), str(case.folder), str(tmp_path / "steps.txt")],
+            env=library_environment(),
+        )
+        deadline = time.monotonic() + 300
+        while len(steps()) < wanted and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(number)
+        assert process.wait(120) == 3
+        assert len(steps()) >= wanted and training_state(path)["step"] == steps()[-1]
+    assert steps() == list(range(1, len(steps()) + 1))  # none again, none left out
 
 
 def test_a_damaged_checkpoint_is_not_gone_on_from(trained):

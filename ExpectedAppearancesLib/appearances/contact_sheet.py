@@ -49,7 +49,7 @@ def write_contact_sheet(case: Case, method: str, textures: list[Texture], most: 
         f"method {method}, {settings.get('backbone', 'unknown backbone')}, {settings.get('iterations', '?')} "
         f"iterations, {len(appearances)} appearances: mean Gram distance {mean:.3f}"
     )
-    path = store.folder_of(case, method) / "contact_sheet.png"
+    path = store.folder_of(case, method) / store.CONTACT_SHEET
     files.write_png(path, np.vstack([_line(title, rows[0].shape[1]), *rows]))
     return path
 

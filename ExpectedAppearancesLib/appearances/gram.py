@@ -6,7 +6,12 @@ from dataclasses import dataclass
 
 import torch
 
+from ..textures.library import CLASS_NAMES, Texture
+from .images import resized, to_vgg_input
 from .vgg import VggFeatures
+
+# Background has none: the field outside the craniotomy stays black, as in a masked frame.
+CLASSES = tuple(CLASS_NAMES)
 
 # A Gram matrix is summed over so many pixels in the compute type, and over these sums in fp32: bf16 loses nothing
 # that matters, and the order of the additions depends neither on the batch nor on the number of threads.
@@ -183,3 +188,25 @@ def texture_grams(
         layer[missing] = float("nan")
         grams.append(layer)
     return grams
+
+
+class TargetGrams:
+    """Targets of textures at the size of the images to make: computed once, the newest few kept."""
+
+    KEPT = 4  # images come texture by texture; more would only take memory
+
+    def __init__(self, vgg: VggFeatures):
+        self._vgg = vgg
+        self._kept: dict[tuple, list[torch.Tensor]] = {}
+
+    def of(self, texture: Texture, height: int, width: int) -> list[torch.Tensor]:
+        """As `texture_grams` gives them, for CLASSES, on the weights' device."""
+        key = (texture.name, height, width)
+        if key not in self._kept:
+            image, labels = resized(texture, height, width)
+            device = self._vgg.conv1_1_weight.device
+            tensors = to_vgg_input(image).to(device), torch.from_numpy(labels).to(device)
+            self._kept[key] = texture_grams(self._vgg, *tensors, CLASSES)
+            while len(self._kept) > self.KEPT:
+                del self._kept[next(iter(self._kept))]
+        return self._kept[key]

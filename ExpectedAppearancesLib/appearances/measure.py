@@ -9,12 +9,9 @@ import numpy as np
 import torch
 
 from ..textures.library import CLASS_NAMES, Texture
-from .gram import ClassTerm, class_masks, rows_of, texture_grams
-from .images import resized, to_vgg_input
+from .gram import CLASSES, ClassTerm, TargetGrams, class_masks, rows_of
+from .images import to_vgg_input
 from .vgg import VggFeatures
-
-CLASSES = tuple(CLASS_NAMES)
-KEPT_TEXTURES = 4  # images come texture by texture; more would only take memory
 
 
 class GramMeasure:
@@ -23,7 +20,7 @@ class GramMeasure:
     def __init__(self, vgg: VggFeatures):
         """vgg: with float32 weights."""
         self.vgg = vgg
-        self._targets: dict[tuple, list[torch.Tensor]] = {}
+        self._targets = TargetGrams(vgg)
 
     @torch.no_grad()
     def distances(self, image_rgb: np.ndarray, labels: np.ndarray, texture: Texture) -> dict[str, float]:
@@ -35,7 +32,7 @@ class GramMeasure:
 
     def _distances(self, image_rgb: np.ndarray, labels: np.ndarray, texture: Texture) -> dict[str, float]:
         device = self.vgg.conv1_1_weight.device
-        targets = self._target(texture, *labels.shape)
+        targets = self._targets.of(texture, *labels.shape)
         masks = self.vgg.carry_masks(class_masks(torch.from_numpy(labels)[None].to(device), CLASSES))
         features = self.vgg(to_vgg_input(image_rgb)[None].to(device))
         found = {}
@@ -44,17 +41,6 @@ class GramMeasure:
             if any(terms) and not torch.isnan(targets[0][index]).any():
                 found[CLASS_NAMES[c]] = sum(float(t.add(rows_of(f), None)) for t, f in zip(terms, features) if t)
         return found
-
-    def _target(self, texture: Texture, height: int, width: int) -> list[torch.Tensor]:
-        key = (texture.name, height, width)
-        if key not in self._targets:
-            image, labels = resized(texture, height, width)
-            device = self.vgg.conv1_1_weight.device
-            tensors = to_vgg_input(image).to(device), torch.from_numpy(labels).to(device)
-            self._targets[key] = texture_grams(self.vgg, *tensors, CLASSES)
-            while len(self._targets) > KEPT_TEXTURES:
-                del self._targets[next(iter(self._targets))]
-        return self._targets[key]
 
 
 @contextlib.contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,51 +74,31 @@ def synthesize_case(
     recipe = Recipe(
         iterations, str(weights_file) if weights_path else None, settings["weights_sha256"], device.type, batch
     )
-    index = _GrowingIndex(case, method, camera, settings, planned, shards)
 
     def report(images: float, name: str) -> None:
-        index.refresh(images)
         text = f"appearance {min(int(images) + 1, len(planned))} of {len(planned)}, {name}"
         progress(min(1.0, images / len(planned)), text)
 
     run_shards(shards, recipe, executor, report)
-    items = index.write(done=True)
+    items = _finished_items(planned, shards)
+    store.write_index(case, method, camera, settings, items, done=True)
     by_class = mean_distances(items)
     total = round(sum(by_class.values()), 4)
     case.record("synthesize", done=True, **settings, gram_distance_mean=total, gram_distance_by_class=by_class)
     return by_class
 
 
-class _GrowingIndex:
-    """The index of what is finished so far, for those who watch; at the end, of all."""
-
-    def __init__(self, case: Case, method: str, camera: Camera, settings: dict, planned: list[dict], shards: list):
-        self._content = case, method, camera, settings
-        self._planned, self._shards = planned, shards
-        self._images, self._next_s = 0, 0.0
-
-    def refresh(self, images: float) -> None:
-        """Write it where images came, but so that writing never takes more than a few hundredths of the time."""
-        if int(images) == self._images or time.monotonic() < self._next_s:
-            return
-        self._images, begin = int(images), time.monotonic()
-        self.write(done=False)
-        now = time.monotonic()
-        self._next_s = now + max(1.0, 50 * (now - begin))
-
-    def write(self, done: bool) -> list[dict]:
-        made = {}
-        for shard in self._shards:
-            made.update(shard.finished())
-        figures = ("gram_distance", "gram_distance_by_class")
-        items = [
-            {name: value for name, value in item.items() if name != "texture"}
-            | {name: made[item["image"]][name] for name in figures}
-            for item in self._planned
-            if done or item["image"] in made
-        ]
-        store.write_index(*self._content, items, done=done)
-        return items
+def _finished_items(planned: list[dict], shards: list) -> list[dict]:
+    """What the index says of each appearance, once all are finished."""
+    made = {}
+    for shard in shards:
+        made.update(shard.finished())
+    figures = ("gram_distance", "gram_distance_by_class")
+    return [
+        {name: value for name, value in item.items() if name != "texture"}
+        | {name: made[item["image"]][name] for name in figures}
+        for item in planned
+    ]
 
 
 def mean_distances(items: list[dict]) -> dict[str, float]:

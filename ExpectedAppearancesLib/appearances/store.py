@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ from ..case.case import Case
 from ..errors import InputError
 from ..geometry.camera import Camera
 
+CONTACT_SHEET = "contact_sheet.png"  # lies beside them
 METHODS = ("surface", "image")
 
 
@@ -47,6 +49,21 @@ def read_index(case: Case, method: str) -> dict | None:
     """The index as written, or None where the method has not run."""
     path = folder_of(case, method) / "index.json"
     return files.read_json(path, "index of the expected appearances") if path.is_file() else None
+
+
+def newest_image(folder: Path) -> tuple[Path | None, int]:
+    """The appearance in a folder that was finished last, and how many there are; images appear there whole.
+
+    For those who watch while appearances are made; the index is written when all are.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            images = [e for e in entries if e.name.endswith(".png") and not e.name.startswith(".")]
+            images = [e for e in images if not e.name.endswith(".labels.png") and e.name != CONTACT_SHEET]
+            newest = max(images, key=lambda entry: entry.stat().st_mtime_ns, default=None)
+            return (Path(newest.path) if newest else None), len(images)
+    except OSError:
+        return None, 0
 
 
 def read_appearances(case: Case, method: str | None = None) -> tuple[str, list[Appearance]]:

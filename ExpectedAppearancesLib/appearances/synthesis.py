@@ -7,18 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
-from ..masks.labels import PARENCHYMA, VESSELS
 from ..textures.library import Texture
-from .gram import ClassGramLoss, texture_grams
-from .images import resized, to_rgb, to_vgg_input
+from .gram import CLASSES, ClassGramLoss, TargetGrams
+from .images import to_rgb, to_vgg_input
 from .lbfgs import minimise
-from .measure import KEPT_TEXTURES
 from .vgg import BGR_MEAN, VggFeatures
-from .workload import DEFAULT_ITERATIONS, PIXELS_AT_ONCE, fine_and_coarse
+from .workload import DEFAULT_ITERATIONS, PIXELS_AT_ONCE
 
-CLASSES = (PARENCHYMA, VESSELS)  # background: the field outside the craniotomy stays black, as in a masked frame
 START_NOISE = 10.0  # grey levels, standard deviation: with less, the Grams' flat spot at zero costs iterations
 
 
@@ -41,7 +37,7 @@ class Synthesizer:
         self.vgg = vgg.to(device)
         self.device = device
         self.iterations = iterations
-        self._targets: dict[tuple, list[torch.Tensor]] = {}
+        self.targets = TargetGrams(self.vgg)
         if device.type == "cuda":
             torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
 
@@ -49,34 +45,8 @@ class Synthesizer:
         self, jobs: Sequence[Job], on_iteration: Callable[[float], None] = lambda fraction: None
     ) -> list[np.ndarray]:
         """RGB uint8 (H, W, 3) of each job; every job must have the same size. on_iteration gets the share done."""
-        height, width = jobs[0].labels.shape
-        start = torch.stack([_start(job) for job in jobs]).to(self.device)
-        fine, coarse = fine_and_coarse((height, width), self.iterations)
-        # A coarse evaluation costs a quarter of a fine one.
-        work = coarse / 4 + fine
-        if coarse:
-            half = (height // 2, width // 2)
-            image = self._minimise(
-                jobs, half, F.interpolate(start, half, mode="area"), coarse, lambda i: on_iteration(i / 4 / work)
-            )
-            # The noise brings back the frequencies that the half size does not have.
-            noise = start - F.interpolate(F.interpolate(start, half, mode="area"), (height, width), mode="bilinear")
-            start = F.interpolate(image, (height, width), mode="bilinear") + noise
-        image = self._minimise(jobs, (height, width), start, fine, lambda i: on_iteration((coarse / 4 + i) / work))
-        return [to_rgb(one) for one in image]
-
-    def _minimise(
-        self,
-        jobs: Sequence[Job],
-        size: tuple[int, int],
-        start: torch.Tensor,
-        iterations: int,
-        on_iteration: Callable[[int], None],
-    ) -> torch.Tensor:
         labels = torch.from_numpy(np.stack([job.labels for job in jobs])).to(self.device)
-        if labels.shape[1:] != size:
-            labels = F.interpolate(labels[:, None].float(), size, mode="nearest")[:, 0].byte()
-        targets = [torch.stack(t) for t in zip(*(self._target(job.texture, *size) for job in jobs))]
+        targets = [torch.stack(t) for t in zip(*(self.targets.of(job.texture, *labels.shape[1:]) for job in jobs))]
         at_once = PIXELS_AT_ONCE if self.device.type == "cpu" else None
         loss = ClassGramLoss(self.vgg, labels, targets, CLASSES, at_once)
         inside = (labels > 0)[:, None].float()
@@ -86,20 +56,11 @@ class Synthesizer:
             values, gradient = loss.value_and_gradient(x * inside + outside)
             return values, gradient * inside
 
+        start = torch.stack([_start(job) for job in jobs]).to(self.device)
         images, _ = minimise(
-            value_and_gradient, start, iterations, after_iteration=lambda iteration, _values: on_iteration(iteration)
+            value_and_gradient, start, self.iterations, after_iteration=lambda i, _: on_iteration(i / self.iterations)
         )
-        return images * inside + outside
-
-    def _target(self, texture: Texture, height: int, width: int) -> list[torch.Tensor]:
-        key = (texture.name, height, width)
-        if key not in self._targets:
-            image, labels = resized(texture, height, width)
-            tensor = to_vgg_input(image).to(self.device)
-            self._targets[key] = texture_grams(self.vgg, tensor, torch.from_numpy(labels).to(self.device), CLASSES)
-            while len(self._targets) > 2 * KEPT_TEXTURES:
-                del self._targets[next(iter(self._targets))]
-        return self._targets[key]
+        return [to_rgb(one) for one in images * inside + outside]
 
 
 def _start(job: Job) -> torch.Tensor:

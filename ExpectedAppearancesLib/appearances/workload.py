@@ -6,12 +6,8 @@ import torch
 
 from .vgg import CONVOLUTIONS, WIDTHS
 
-# Ends as near to the texture as 50 iterations from noise at full size, the paper's (docs/benchmarks.md).
-DEFAULT_ITERATIONS = 32
-# The other iterations are spent at half the size, at a quarter of the cost; of a half below 128 px they take over too
-# little of the texture (at 64 px they ended 20 % farther from it).
-FINE_SHARE = 0.75
-LEAST_COARSE_PX = 128
+# Ends as near to the texture as the paper's 50 iterations from small noise (docs/benchmarks.md).
+DEFAULT_ITERATIONS = 30
 PIXELS_AT_ONCE = 2**17  # through the network on a processor: larger tensors are given anew by the system every time
 SHARE_OF_FREE = 0.5  # others compute here too
 # Peak resident memory of one image of 256 px besides the history of L-BFGS (2 x 3 x 4 bytes a pixel and pair) was
@@ -20,20 +16,9 @@ BYTES_PER_PIXEL = 4700
 VECTORS = 12  # of an image's size, in fp32, that an iteration holds besides the history
 
 
-def fine_and_coarse(shape: tuple[int, int], iterations: int) -> tuple[int, int]:
-    """Iterations at full size and at half the size."""
-    fine = max(1, round(FINE_SHARE * iterations))
-    if min(shape) < 2 * LEAST_COARSE_PX:
-        fine = iterations
-    return fine, iterations - fine
-
-
 def bytes_per_image(shape: tuple[int, int], iterations: int) -> int:
-    """Memory that one more image in the batch takes: history and vectors of the larger of both levels."""
-    pixels = shape[0] * shape[1]
-    fine, coarse = fine_and_coarse(shape, iterations)
-    pairs = max(fine, coarse / 4)
-    return int(pixels * 3 * 4 * (2 * min(pairs, 100) + VECTORS))
+    """Memory that one more image in the batch takes: history and vectors."""
+    return shape[0] * shape[1] * 3 * 4 * (2 * min(iterations, 100) + VECTORS)
 
 
 def images_at_once(shape: tuple[int, int], iterations: int, device: torch.device) -> int:
@@ -69,6 +54,4 @@ def operations_per_evaluation(shape: tuple[int, int], backbone: str, class_share
 def operations_per_image(
     shape: tuple[int, int], backbone: str, class_shares: tuple[float, ...], iterations: int
 ) -> float:
-    fine, coarse = fine_and_coarse(shape, iterations)
-    one = operations_per_evaluation(shape, backbone, class_shares)
-    return one * (fine + 1) + (one / 4 * (coarse + 1) if coarse else 0.0)
+    return operations_per_evaluation(shape, backbone, class_shares) * (iterations + 1)

@@ -11,7 +11,9 @@ import math
 import cv2
 import numpy as np
 
-OPENING = 0.5  # share of views in which the craniotomy hides part of the surface
+OPENING = 0.6  # share of views in which the craniotomy hides part of the surface; in the others tissue goes on
+WIDEST = 0.12  # of the image's side: how far it goes on at most beyond the mesh's rim
+EVERYWHERE = 0.2  # share of those in which it fills what it can reach
 BLACK, CORTEX, DRAPE = 0.4, 0.25, 0.35  # shares of what is seen outside
 
 
@@ -42,6 +44,34 @@ def opening(where_px: np.ndarray, centre_px: np.ndarray, extent_px: float, rng) 
     shift = size / 2 - np.asarray(centre_px) * scale
     there = cv2.transform(where_px, np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], np.float32))
     return cv2.remap(mask, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def continue_tissue(image: np.ndarray, inside: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
+    """`image` (H, W, 3) uint8 with its tissue mirrored over the rim of `inside` (H, W) uint8, as far as a random and
+    uneven width; and where tissue is now, bool (H, W).
+
+    A patient's cortex does not end where the mesh was cut: where it does so in training, the rim tells the depth, and
+    tells it wrongly in the field.
+    """
+    height, width = inside.shape
+    # From a little inside, so that the rim leaves no line; at half the size, as this is slow.
+    kept = cv2.erode(inside, np.ones((5, 5), np.uint8))[::2, ::2]
+    if not kept.any() or inside.all():
+        return image, inside > 0
+    away, nearest = cv2.distanceTransformWithLabels(1 - kept, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    there = np.flatnonzero(kept)
+    place_of = np.zeros((int(nearest.max()) + 1, 2), np.float32)
+    place_of[nearest.ravel()[there]] = np.stack(np.divmod(there, kept.shape[1])[::-1], axis=1)
+    own = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in kept.shape[::-1])), axis=-1)
+    mirrored = 2 * place_of[nearest] - own
+    reachable = cv2.remap(kept, mirrored, None, cv2.INTER_NEAREST)
+    uneven = cv2.resize(rng.uniform(0.5, 1.5, (4, 4)).astype(np.float32), kept.shape[::-1])
+    width_px = np.inf if rng.uniform() < EVERYWHERE else rng.uniform(0, WIDEST) * len(kept)
+    grown = cv2.resize(reachable * (away < width_px * uneven), (width, height), interpolation=cv2.INTER_NEAREST)
+    where_px = cv2.resize(2 * mirrored, (width, height))
+    grown &= 1 - cv2.resize(kept, (width, height), interpolation=cv2.INTER_NEAREST)
+    cv2.copyTo(cv2.remap(image, where_px, None, cv2.INTER_LINEAR), grown, image)
+    return image, (grown | inside) > 0
 
 
 def fill_outside(image: np.ndarray, outside: np.ndarray, cortex: np.ndarray, rng) -> np.ndarray:

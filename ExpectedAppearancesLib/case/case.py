@@ -6,6 +6,7 @@ import datetime
 import os
 import platform
 import shutil
+from collections.abc import Callable
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
@@ -143,8 +144,11 @@ class Case:
         return vessels, cortex, camera
 
     @staticmethod
-    def open(folder: Path) -> Case:
-        """Open a case folder and check its inputs against the manifest. Raises InputError with all problems."""
+    def open(folder: Path, sha256: Callable[[Path], str] = files.sha256) -> Case:
+        """Open a case folder and check its inputs against the manifest. Raises InputError with all problems.
+
+        sha256: of a file, for who opens the case again and again and knows which files have changed.
+        """
         folder = Path(folder).absolute()
         path = folder / MANIFEST_NAME
         if not path.is_file():
@@ -154,7 +158,7 @@ class Case:
         for name, entry in manifest["inputs"].items():
             if not (folder / entry["file"]).is_file():
                 problems.add(f"{folder / entry['file']}: {name} of the case is missing; restore it or make a new case.")
-            elif files.sha256(folder / entry["file"]) != entry["sha256"]:
+            elif sha256(folder / entry["file"]) != entry["sha256"]:
                 problems.add(
                     f"{folder / entry['file']}: {name} is not the file the case was made with (SHA-256 differs); "
                     "restore it, or make a new case, since all stages rest on it."
@@ -168,6 +172,13 @@ class Case:
         self.manifest = _read_manifest(path)  # another process may have recorded a stage meanwhile
         entry = self.manifest["stages"].setdefault(stage, {})
         entry.update({"updated": _now(), "versions": _versions()} | values)
+        files.write_json(path, self.manifest)
+
+    def attach(self, name: str, entry: dict) -> None:
+        """Note a file that lies in the case and that no stage depends on, in manifest["attachments"][name]."""
+        path = self.folder / MANIFEST_NAME
+        self.manifest = _read_manifest(path)
+        self.manifest.setdefault("attachments", {})[name] = entry
         files.write_json(path, self.manifest)
 
 

@@ -67,8 +67,8 @@ class Mesh:
         decimation.Update()
         return Mesh.from_polydata(decimation.GetOutput())
 
-    def to_polydata(self):
-        """vtkPolyData of its own memory, with point normals."""
+    def to_polydata(self, normals: bool = True):
+        """vtkPolyData of its own memory, with point normals unless nothing is lit."""
         from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
         from vtkmodules.vtkCommonCore import vtkPoints
         from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
@@ -81,12 +81,13 @@ class Mesh:
             numpy_to_vtkIdTypeArray(offsets, deep=True),
             numpy_to_vtkIdTypeArray(np.ascontiguousarray(self.triangles.ravel(), np.int64), deep=True),
         )
-        normals = numpy_to_vtk(self.vertex_normals().astype(np.float32), deep=True)
-        normals.SetName("Normals")
         polydata = vtkPolyData()
         polydata.SetPoints(points)
         polydata.SetPolys(cells)
-        polydata.GetPointData().SetNormals(normals)
+        if normals:
+            array = numpy_to_vtk(self.vertex_normals().astype(np.float32), deep=True)
+            array.SetName("Normals")
+            polydata.GetPointData().SetNormals(array)
         return polydata
 
     @classmethod

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from ..appearances.store import METHODS
+from ..appearances.store import METHODS, newest_image
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
 from .case import MANIFEST_NAME, Case
 from .steps import Recorded
 
+STOPPED = ("cancelled", "failed")  # outcomes of a run as its record names them
 LARGEST_HEADER_BYTES = 1 << 24
 
 
@@ -25,6 +26,7 @@ class CaseReader:
     def __init__(self) -> None:
         self._kept: dict[tuple, tuple] = {}
         self._case: Case | None = None
+        self._overview: tuple = (None, False)  # what `overview_changed` depends on, its answer
 
     def case(self, folder: str) -> tuple[Case | None, str]:
         """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
@@ -48,12 +50,13 @@ class CaseReader:
             case.manifest,
             case.camera,
             index,
-            overview_changed(case, index) if method == "surface" and index else False,
+            self._overview_changed(case, index, index_sha256) if method == "surface" and index else False,
             model,
             index_sha256,
             state.get("step", 0),
             "stale" if stale else "known" if rows else "",
             verdict(rows, limits) if rows else None,
+            (self._once(case.folder / "runs" / "study.json", _read_object) or {}).get("outcome") in STOPPED,
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:
@@ -81,9 +84,13 @@ class CaseReader:
             return state["curve"]
         return (self._once(case.model_folder / "training.json", _read_object) or {}).get("curve", [])
 
+    def newest_image(self, case: Case, method: str) -> tuple[Path | None, int]:
+        """The appearance that was finished last, and how many there are."""
+        return self._once(case.appearances_folder / method, newest_image) or (None, 0)
+
     def _open(self, path: Path) -> tuple[Case | None, str]:
         try:
-            case = Case.open(path.parent)
+            case = Case.open(path.parent, lambda file: self._once(file, files.sha256))
         except InputError as error:
             return None, str(error)
         known = self._case
@@ -92,6 +99,13 @@ class CaseReader:
             case.__dict__.update({n: known.__dict__[n] for n in ("vessels", "cortex") if n in known.__dict__})
         self._case = case
         return case, ""
+
+    def _overview_changed(self, case: Case, index: dict, index_sha256: str) -> bool:
+        craniotomy = case.manifest["stages"].get("render", {}).get("craniotomy")
+        version = (case.folder, str(case.manifest["inputs"]), str(craniotomy), index_sha256)
+        if self._overview[0] != version:
+            self._overview = (version, overview_changed(case, index))
+        return self._overview[1]
 
     def _once(self, path: Path, read: Callable[[Path], object]):
         """read(path), again only where the file changed; None where there is no such file."""

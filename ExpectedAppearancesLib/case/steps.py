@@ -48,7 +48,8 @@ class Chosen:
     changed: names of the inputs ("vessel model", ...) that differ from those of the case. camera: None where it is not
     given or wrong, then camera_problem says why. poses: {"poses", "seed", "ranges", "craniotomy"} as `render` records
     them, None where they cannot be had. textures: name -> SHA-256 of image and labels, "" while it has not been read.
-    synthesis: {"size_px", "iterations"}. running: kinds of runs that go on.
+    synthesis: {"size_px", "iterations"}. running: kinds of runs that go on. scan_unsaved: the chosen MRI is not in the
+    case, which changes nothing that is made from it.
     """
 
     folder: str = ""
@@ -63,6 +64,7 @@ class Chosen:
     synthesis: dict = field(default_factory=dict)
     preset: str = ""
     running: frozenset[str] = frozenset()
+    scan_unsaved: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ class Recorded:
     """What the case folder holds: case.json, the camera, the index of the appearances, model.json; None where absent.
 
     overview_changed: the view that method `surface` synthesises on is another one now. appearances_sha256: of the
-    index. steps_trained: of a training that was stopped, 0 where there is none. validation: whether figures are there,
+    index. steps_trained: of a training that was stopped, 0 where there is none. study_stopped: the last study was ended
+    before it was done. validation: whether figures are there,
     verdict of `evaluation.verdict` on them: (ready, reasons).
     """
 
@@ -84,6 +87,7 @@ class Recorded:
     steps_trained: int = 0
     validation: str = ""
     verdict: tuple[bool, tuple[str, ...]] | None = None
+    study_stopped: bool = False
 
 
 def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
@@ -95,7 +99,7 @@ def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
         "textures": _textures(chosen),
         "appearances": _appearances(chosen, recorded),
         "training": _training(chosen, recorded),
-        "validation": _validation(recorded),
+        "validation": _validation(chosen, recorded),
     }
     names = {"case": "the case", "microscope": "the microscope", "poses": "the poses"}
     names |= {"appearances": "the expected appearances", "training": "the model"}
@@ -166,6 +170,8 @@ def _case(chosen: Chosen, recorded: Recorded) -> Step:
         changed.append("microscope")
     if changed:
         return Step(StepState.STALE, f"Changed since the case was saved: {_listed(changed)}. Save the case again.")
+    if chosen.scan_unsaved:
+        return Step(StepState.DONE, "Saved, but without the MRI that is chosen now: save again to add it.")
     return Step(StepState.DONE, "Saved.")
 
 
@@ -265,7 +271,9 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     return Step(StepState.DONE, f"Trained with preset {trained}.")
 
 
-def _validation(recorded: Recorded) -> Step:
+def _validation(chosen: Chosen, recorded: Recorded) -> Step:
+    if "study" in chosen.running:
+        return Step(StepState.RUNNING, "A study is going on: for each texture a model is trained without it.")
     if recorded.verdict is None:
         return Step(StepState.MISSING, "Train the model first." if recorded.model is None else "No figures yet.")
     ready, reasons = recorded.verdict

@@ -65,7 +65,8 @@ def main(argv: Sequence[str] | None = None, progress: Progress | None = None) ->
 
     progress = progress or Progress()
     # `new` must leave a case that it refuses to replace as it was.
-    case_folder = None if args.command == "new" else getattr(args, "case", None)
+    cases = getattr(args, "cases", None) or [getattr(args, "case", None)]
+    case_folder = None if args.command == "new" else cases[0]
     with log_file(args.command, case_folder) as log_path:
         try:
             with termination_cancels():

@@ -56,6 +56,7 @@ def run(args, progress) -> None:
     from ..masks.stage import render_case
     from ..poses.craniotomy import find_craniotomy
     from ..poses.sampling import PoseRanges
+    from ..runs.record import exclusive
 
     case = Case.open(args.case)
     ranges = PoseRanges(
@@ -66,4 +67,5 @@ def run(args, progress) -> None:
         args.in_view,
     )
     craniotomy = find_craniotomy(case.vessels, case.cortex, case.space, args.point, args.normal)
-    render_case(case, progress, args.poses, args.seed, ranges, craniotomy, args.circular_field)
+    with exclusive(case.folder, "render"):
+        render_case(case, progress, args.poses, args.seed, ranges, craniotomy, args.circular_field)

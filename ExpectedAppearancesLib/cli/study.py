@@ -11,7 +11,8 @@ def add_parser(subparsers) -> None:
         "study",
         help="leave-one-texture-out, number of textures, rivals and robustness, in one report",
         description="Trains models on some textures of a case and tests them on frames of the others, whose poses are "
-        "known. Protocol strict: unseen texture and unseen poses. Protocol loto: the paper's leave-one-texture-out, "
+        "known: those of --poses, else views of the case's own appearances. Protocol strict: unseen texture and unseen "
+        "poses. Protocol loto: the paper's leave-one-texture-out, "
         "where training views repeat the poses of the test frames. Writes CASE/study/study.json and one HTML report, "
         "its pictures inside. Interrupted, it goes on where it was; the case's own model stays as it is.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -21,11 +22,12 @@ def add_parser(subparsers) -> None:
         "--poses",
         nargs="+",
         type=Path,
-        required=True,
         metavar="FILE",
-        help="poses.json with the KNOWN poses of each case's frames, their 'style' called like the texture",
+        help="poses.json with the KNOWN poses of each case's frames, their 'style' called like the texture; left out: "
+        "frames are drawn from the case's appearances, at poses of their own",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the report")
+    parser.add_argument("--frames", type=int, default=24, metavar="N", help="frames to draw of each texture")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the report; left out: CASE/study/report")
     parser.add_argument("--protocols", type=_names, default="strict,loto", metavar="A,B", help="strict, loto, or none")
     parser.add_argument(
         "--preset",
@@ -65,12 +67,20 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def run(args: argparse.Namespace, progress) -> None:
-    from ..errors import InputError
+    import contextlib
+
+    from ..errors import Problems
     from ..evaluation.study import StudySettings, run_study, study_path
     from ..evaluation.study_report import study_text
+    from ..runs.record import exclusive
 
-    if len(args.poses) != len(args.cases):
-        raise InputError(f"--poses: {len(args.poses)} files for {len(args.cases)} cases; give one for each, in order.")
+    problems = Problems()
+    if args.poses and len(args.poses) != len(args.cases):
+        problems.add(f"--poses: {len(args.poses)} files for {len(args.cases)} cases; give one for each, in order.")
+    if args.out is None and len(args.cases) > 1:
+        problems.add("--out: missing; give a folder for the report on several cases.")
+    problems.raise_if_any()
+    out = args.out or study_path(args.cases[0]).parent / "report"
     settings = StudySettings(
         protocols=() if args.protocols == ("none",) else args.protocols,
         presets=args.preset,
@@ -84,8 +94,15 @@ def run(args: argparse.Namespace, progress) -> None:
         device=args.device,
         method=args.appearances,
         executor=args.executor,
+        frames=args.frames,
     )
-    for case, study in zip(args.cases, run_study(list(zip(args.cases, args.poses)), args.out, settings, progress)):
+    pairs = list(zip(args.cases, args.poses or [None] * len(args.cases)))
+    with contextlib.ExitStack() as locks:
+        for case in args.cases:
+            if (case / "case.json").is_file():  # else the study says so
+                locks.enter_context(exclusive(case.absolute(), "study"))
+        studies = run_study(pairs, out, settings, progress)
+    for case, study in zip(args.cases, studies):
         print(study_text(study))
         print(f"Figures: {study_path(case)}")
-    print(f"Report: {args.out.absolute() / 'report.html'}")
+    print(f"Report: {out.absolute() / 'report.html'}")

@@ -38,9 +38,7 @@ def add_parser(subparsers) -> None:
     )
     parser.add_argument("--size", type=int, help="height of the images, px; left out: 384 (surface) or 256 (image)")
     parser.add_argument("--seeds", type=int, default=1, help="surface: appearances per texture")
-    parser.add_argument(
-        "--iterations", type=int, default=32, help="L-BFGS iterations, some of them at half the size from 256 px"
-    )
+    parser.add_argument("--iterations", type=int, default=30, help="L-BFGS iterations")
     parser.add_argument("--batch", type=int, help="images optimised together; left out: as many as memory allows")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     parser.add_argument(
@@ -53,7 +51,7 @@ def add_parser(subparsers) -> None:
 
 def run(args, progress) -> None:
     from ..case.case import Case
-    from ..errors import InputError, Problems
+    from ..errors import Problems
     from ..textures.library import read_library, shipped_textures_folder
 
     problems = Problems()
@@ -72,11 +70,26 @@ def run(args, progress) -> None:
         with problems.collect():
             check_executor(args.executor)
     problems.raise_if_any()
+    from ..runs.record import exclusive
 
+    # Processes and machines that make the same appearances divide the work.
+    with exclusive(case.folder, "synthesize", work=_work(args, textures)):
+        _synthesize(args, case, textures, progress)
+
+
+def _work(args, textures) -> str:
+    import hashlib
+
+    given = [args.method, args.preset, args.size, args.seeds, args.iterations, str(args.weights)]
+    return hashlib.sha256(repr(given + sorted(t.sha256 for t in textures)).encode()).hexdigest()
+
+
+def _synthesize(args, case, textures, progress) -> None:
     from ..appearances.contact_sheet import write_contact_sheet
     from ..appearances.stage import synthesize_case
     from ..appearances.vgg import download_vgg19
     from ..devices import choose_device
+    from ..errors import InputError
 
     paper = args.preset == "paper"
     method = "image" if paper else args.method

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+ORPHAN_ENDS_S = 60.0
+
 
 def add_parser(subparsers) -> None:
     parser = subparsers.add_parser(
@@ -53,8 +55,6 @@ def run(args, progress) -> None:
 
     # Threads that wait for each other must sleep, not spin: rendering of the next views needs the core.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from dataclasses import replace
-
     from ..case.case import Case
     from ..errors import Problems
 
@@ -69,6 +69,16 @@ def run(args, progress) -> None:
     if args.model_folder is None and (args.exclude or args.poses or args.no_inner_texture):
         problems.add("--model-folder: missing; --exclude, --poses and --no-inner-texture make no model for use.")
     problems.raise_if_any()
+
+    from ..runs.record import exclusive
+
+    # A study that was killed leaves a training that ends when it next speaks.
+    with exclusive(args.model_folder or case.folder, "train", ORPHAN_ENDS_S if args.model_folder else 0.0):
+        _train(args, case, progress)
+
+
+def _train(args, case, progress) -> None:
+    from dataclasses import replace
 
     from ..devices import choose_device
     from ..model.fold import Fold

@@ -21,6 +21,7 @@ from ..masks.exposed import exposed_vessels
 from ..model.encoding import PoseEncoding
 from ..poses.craniotomy import find_craniotomy
 from ..registration.confidence import Confidence
+from ..registration.covariance import CovarianceModel
 from ..registration.decoding import EVIDENCE
 from ..registration.predictor import EXPOSED_VESSELS_NAME, FORMAT_VERSION
 from .vessel_tree import generate_case_meshes
@@ -30,6 +31,7 @@ MIDDLE, GAIN = 0.55, 0.33  # colour = MIDDLE + GAIN x coordinate / scale, 0..1
 VESSEL_RGB = (0.42, 0.0, 0.05)  # green 0: the network takes no point from vessels
 BACKGROUND_RGB = (0.0, 0.0, 0.0)
 SIZE_PX = 128
+ERROR_RAD, ERROR_MM = 0.002, 0.05  # twice what its poses err by, root mean square
 CLOSENESS = 0.67  # of the distance from which all vessels fit into the view
 CAMERA = Camera(640, 480, 1900.0, 1900.0, 331.0, 226.0)
 SAMPLE_FRAMES = 90
@@ -241,6 +243,7 @@ def _write_model(case: Case) -> None:
             "distance_mm": [0.6 * _distance_mm(case), 1.6 * _distance_mm(case)],
         },
         "confidence": confidence.to_dict(),
+        "covariance": CovarianceModel(np.diag(np.repeat([ERROR_RAD, ERROR_MM], 3) ** 2), 0.0).to_dict(),
         "vessels_sha256": case.manifest["inputs"]["vessels"]["sha256"],
     }
     exposed = exposed_vessels(case.vessels, case.cortex, craniotomy.outward_axis)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,24 @@ def write_curves(path: Path, errors: FrameErrors, styles: Sequence[str | None]) 
         axes.legend(loc="lower right", frameon=False)
     figure.axes[0].set_ylabel("share of frames, %")
     figure.axes[1].text(0.97, 0.35, f"AUC {add_auc(errors):.3f}", transform=figure.axes[1].transAxes, ha="right")
+    write_figure(path, figure)
+
+
+def write_reliability(path: Path, reliabilities: Mapping[str, Mapping]) -> None:
+    """Reliability diagram: share of frames with ADD below 3 mm against confidence, a line for each label; a mark's area
+    is the number of its frames. Values as `metrics.reliability` gives them."""
+    figure = new_figure(5.6, 5.0)
+    axes = figure.subplots()
+    axes.plot([0, 100], [0, 100], color=_STYLE, lw=0.8)
+    for label, values in reliabilities.items():
+        rows, total = values["bins"], sum(row["frames"] for row in values["bins"])
+        x, y = ([100 * row[key] for row in rows] for key in ("confidence", "add_below_3mm"))
+        name = f"{label + ', ' if label else ''}calibration error {values['expected_calibration_error']:.3f}"
+        (line,) = axes.plot(x, y, lw=1.2, label=name, **({} if len(reliabilities) > 1 else {"color": _ALL}))
+        axes.scatter(x, y, [8 + 400 * row["frames"] / total for row in rows], color=line.get_color(), alpha=0.7)
+    axes.set(xlabel="confidence, %", ylabel="frames with ADD below 3 mm, %", xlim=(-3, 103), ylim=(-3, 103))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left", frameon=False, fontsize=8)
     write_figure(path, figure)
 
 

@@ -15,7 +15,7 @@ from ..errors import InputError, Problems
 from ..geometry.camera import Camera
 from ..registration.poses_file import Frame, read_poses, write_poses
 from ..registration.record import frame_record
-from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics
+from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics, reliability
 
 ProgressFunction = Callable[[float, str], None]
 NEEDED_MB = 50.0
@@ -51,7 +51,8 @@ def evaluate(
 
     styles: only frames of these. predicted_path: compare this poses file instead of running the model. predictor: used
     in place of the case's own. Writes metrics.json, predicted.json, curves.png, styles.png, overlays/*.png,
-    overlays.png and report.html into out_folder. Raises InputError with all problems before anything is registered.
+    overlays.png, report.html and, where confidences are known, reliability.png
+    into out_folder. Raises InputError with all problems before anything is registered.
     """
     out_folder = Path(out_folder).absolute()
     problems = Problems()
@@ -78,7 +79,7 @@ def evaluate(
 
 
 def compare(case: Case, camera: Camera, true: list[Frame], predicted: list[Frame]) -> Evaluation:
-    """Errors and metrics of paired frames, with the mean-pose baseline and the latency where it is known."""
+    """Errors and metrics of paired frames, with the mean-pose baseline, and latency and reliability where known."""
     vertices_mm = case.vessels.vertices_mm
     true_poses = np.array([frame.camera_from_world for frame in true])
     poses, accepted = [frame.camera_from_world for frame in predicted], [frame.accepted for frame in predicted]
@@ -90,6 +91,9 @@ def compare(case: Case, camera: Camera, true: list[Frame], predicted: list[Frame
     if latency_ms:
         median, p95 = np.percentile(latency_ms, (50, 95))
         result["latency_ms"] = {"median": float(median), "p95": float(p95)}
+    confidence = [frame.extra.get("confidence") for frame in predicted]
+    if None not in confidence:
+        result["reliability"] = reliability(confidence, errors)
     return Evaluation(camera, true, predicted, errors, result)
 
 
@@ -149,7 +153,7 @@ def register_frames(true: list[Frame], camera: Camera, predictor, progress: Prog
 
 
 def _write(case: Case, evaluation: Evaluation, folder: Path, progress: ProgressFunction) -> None:
-    from .curves import curve_points, write_curves, write_style_bars
+    from .curves import curve_points, write_curves, write_reliability, write_style_bars
     from .report import write_report
 
     errors, styles = evaluation.errors, evaluation.styles
@@ -159,6 +163,8 @@ def _write(case: Case, evaluation: Evaluation, folder: Path, progress: ProgressF
     progress(0.85, "Drawing the curves")
     write_curves(folder / "curves.png", errors, styles)
     write_style_bars(folder / "styles.png", evaluation.metrics)
+    if "reliability" in evaluation.metrics:
+        write_reliability(folder / "reliability.png", {"": evaluation.metrics["reliability"]})
     progress(0.9, "Drawing the overlays")
     _write_overlays(case, evaluation, folder)
     write_report(folder, case.folder.name, evaluation)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.pose import geodesic_angle_rad, pose_from_rotation
+from ..registration.confidence import GOOD_ADD_MM
 
 ADD_RANGE_MM = 20.0
 ACCURACY_LIMITS = (3, 5)  # n of the reported n mm-n deg
@@ -119,6 +120,7 @@ def summary(errors: FrameErrors) -> dict:
             "depth_mean": _mean(errors.depth_mm),
         },
         "accuracy": {f"{n}mm-{n}deg": accuracy(errors, n) for n in ACCURACY_LIMITS},
+        "add_below_3mm": add_accuracy(errors, GOOD_ADD_MM),
         "add_auc_20mm": add_auc(errors),
         "rotation_deg": _mean(errors.rotation_deg),
         "rotation_deg_median": _quantile(errors.rotation_deg, 50),
@@ -136,6 +138,28 @@ def metrics(errors: FrameErrors, styles: Sequence[str | None]) -> dict:
         accepted_only = summary(of_style.select(of_style.accepted))
         result["styles"][label] = summary(of_style) | {"accepted_only": accepted_only}
     return result
+
+
+def reliability(confidence: np.ndarray, errors: FrameErrors, bins: int = 10) -> dict:
+    """What the confidences (N,) 0..1 were worth: in each of `bins` equal ranges the number of frames, their mean
+    confidence and the share with ADD below GOOD_ADD_MM; and the mean gap between both, weighted by the numbers."""
+    confidence, good = np.asarray(confidence, float), errors.add_mm < GOOD_ADD_MM
+    which = np.minimum((confidence * bins).astype(int), bins - 1)
+    rows = []
+    for b in range(bins):
+        own = which == b
+        if own.any():
+            rows.append(
+                {
+                    "from": b / bins,
+                    "to": (b + 1) / bins,
+                    "frames": int(own.sum()),
+                    "confidence": float(confidence[own].mean()),
+                    "add_below_3mm": float(good[own].mean()),
+                }
+            )
+    gaps = [row["frames"] * abs(row["confidence"] - row["add_below_3mm"]) for row in rows]
+    return {"expected_calibration_error": sum(gaps) / max(1, len(confidence)), "bins": rows}
 
 
 def mean_pose(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:

@@ -57,6 +57,10 @@ ADD below 0 to 20 mm. Frames without a pose have no ADD and count as misses in s
 refused frames that have a pose are in the figures of all frames, and left out of accepted only.</p>
 <h2>Accuracy against threshold</h2><img src="{{ curves }}" alt="Accuracy-threshold curves">
 {% if by_style %}<h2>Styles</h2><img src="{{ by_style }}" alt="Figures of each style">{% endif %}
+{% if reliability %}<h2>Confidence</h2>
+<p>Share of frames with ADD below 3 mm against the confidence they were given; below the diagonal confidence was too
+high. The expected calibration error is the mean distance from the diagonal.</p>
+<img src="{{ reliability }}" alt="Reliability diagram">{% endif %}
 <h2>Overlays</h2>
 <p>Outline of the vessels at the <span class="true">true</span> and at the <span class="predicted">predicted</span>
 pose, from the smallest error to the largest.</p><img src="{{ overlays }}" alt="Overlays">
@@ -81,6 +85,7 @@ def write_report(folder: Path, case_name: str, evaluation) -> None:
         without_pose=result["without_pose"],
         curves=embedded(folder / "curves.png"),
         by_style=embedded(folder / "styles.png") if len(result["styles"]) > 1 else "",
+        reliability=embedded(folder / "reliability.png") if "reliability" in result else "",
         overlays=embedded_photograph(folder / "overlays.png"),
     )
     files.write_bytes(folder / "report.html", html.encode("utf-8"))

@@ -26,6 +26,7 @@ from .evaluate import Evaluation, check_out, compare, known_frames, overlay_imag
 from .metrics import add_auc, add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
+from .study_frames import FRAMES_PER_TEXTURE, drawn_frames
 from .verdict import STUDY_FORMAT
 
 FORMAT_VERSION = 1
@@ -39,7 +40,8 @@ TRAINING_SHARE = 0.85  # of the progress
 @dataclass(frozen=True)
 class StudySettings:
     """What to do. styles: textures to leave out, None for all that have frames. steps, minutes: of each training; None
-    for the preset's. method: of the appearances; None for the one that is complete."""
+    for the preset's. method: of the appearances; None for the one that is complete. frames: of each texture, where they
+    are drawn from the appearances."""
 
     protocols: tuple[str, ...] = PROTOCOLS
     presets: tuple[str, ...] = ("quick",)
@@ -53,6 +55,7 @@ class StudySettings:
     device: str = "auto"
     method: str | None = None
     executor: str = LOCAL
+    frames: int = FRAMES_PER_TEXTURE
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,20 +78,21 @@ class StudyCase:
 
 
 def run_study(
-    pairs: Sequence[tuple[Path, Path]],
+    pairs: Sequence[tuple[Path, Path | None]],
     out_folder: Path,
     settings: StudySettings,
     progress: ProgressFunction = lambda _fraction, _message: None,
 ) -> list[dict]:
     """Study each (case folder, poses file with known poses); returns the content of each CASE/study/study.json.
 
+    Without a poses file the test frames are drawn from the case's own appearances, see study_frames.
     Writes study.json into each case and report.html with its figures into out_folder. Killed, it goes on: a finished
     fold is not trained again. Raises InputError with all problems before anything is trained.
     """
     from .study_report import write_study_report
 
     out_folder = Path(out_folder).absolute()
-    studied = _check(pairs, out_folder, settings)
+    studied = _check(pairs, out_folder, settings, progress)
     jobs = [job for one in studied for job in _jobs(one, settings)]
     waiting = [job for job in jobs if not is_trained(job)]
     for one in studied:
@@ -127,7 +131,7 @@ def read_study(case_folder: Path) -> dict | None:
     return values
 
 
-def _check(pairs, out_folder: Path, settings: StudySettings) -> list[StudyCase]:
+def _check(pairs, out_folder: Path, settings: StudySettings, progress: ProgressFunction) -> list[StudyCase]:
     problems, studied = Problems(), []
     for word, chosen, known in (("protocols", settings.protocols, PROTOCOLS), ("preset", settings.presets, PRESETS)):
         for name in chosen:
@@ -136,17 +140,29 @@ def _check(pairs, out_folder: Path, settings: StudySettings) -> list[StudyCase]:
     for name, value in (("steps", settings.steps), ("minutes", settings.minutes)):
         if value is not None and value <= 0:
             problems.add(f"--{name}: {value}; it must be above 0.")
-    if settings.robustness_frames < 1:
-        problems.add(f"--robustness-frames: {settings.robustness_frames}; give at least 1.")
+    for word, count in (("robustness-frames", settings.robustness_frames), ("frames", settings.frames)):
+        if count < 1:
+            problems.add(f"--{word}: {count}; give at least 1.")
     with problems.collect():
         check_out(out_folder)
     with problems.collect():
         check_executor(settings.executor)
     for case_folder, poses_path in pairs:
         with problems.collect():
+            if poses_path is None:
+                if problems.found:
+                    continue  # drawing takes its time
+                poses_path = _drawn(Path(case_folder), settings, progress)
             studied.append(_open(Path(case_folder), Path(poses_path).absolute(), settings))
     problems.raise_if_any()
     return studied
+
+
+def _drawn(folder: Path, settings: StudySettings, progress: ProgressFunction) -> Path:
+    def report(_fraction: float, text: str) -> None:
+        progress(0.0, text)
+
+    return drawn_frames(Case.open(folder), settings.method, settings.frames, settings.seed, report)
 
 
 def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:

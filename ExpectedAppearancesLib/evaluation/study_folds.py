@@ -6,7 +6,6 @@ import contextlib
 import re
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -15,10 +14,10 @@ from pathlib import Path
 
 from .. import files
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, CancelledError, ExpectedAppearancesError, InputError
-from ..runs.environment import library_environment
+from ..runs.environment import library_environment, python_for_runs
 
 PROTOCOLS = ("strict", "loto")
-COMMAND = (sys.executable, "-m", "ExpectedAppearancesLib")
+COMMAND = (python_for_runs(), "-m", "ExpectedAppearancesLib")
 PATIENCE_S = 30.0  # that a stopped training is given to save what it has
 _PROGRESS = re.compile(r"^\s*(\d+) %  (.*?)(?: \([^()]* left\))?$")  # the time left is the fold's, not the study's
 SPACE_MB = {"fold": 60.0, "under way": 400.0}  # of a finished fold, and of a training with its checkpoint

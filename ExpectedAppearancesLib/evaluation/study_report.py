@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .. import __version__, files
+from .curves import write_reliability
 from .report import COLUMNS, STYLE_SHEET, cells, embedded, embedded_photograph
 from .study_figures import write_study_curves, write_texture_bars, write_texture_counts
 
@@ -48,6 +49,10 @@ ADD below 0 to 20 mm. Frames without a pose count as misses in shares and AUC. R
 these figures; rows "accepted only" leave them out.</p>{% endif %}
 {% if curves %}<h2>Accuracy against threshold</h2><img src="{{ curves }}" alt="Accuracy-threshold curves">{% endif %}
 {% if bars %}<h2>Each left-out texture</h2><img src="{{ bars }}" alt="Mean ADD on each left-out texture">{% endif %}
+{% if reliability %}<h2>Confidence</h2>
+<p>Share of frames with ADD below 3 mm against the confidence they were given; below the diagonal confidence was too
+high. The expected calibration error is the mean distance from the diagonal.</p>
+<img src="{{ reliability }}" alt="Reliability diagram">{% endif %}
 {% for name, rows in per_style %}<details><summary>{{ name }}</summary>{{ figures(rows, "left-out texture") }}</details>
 {% endfor %}
 {% if counts %}<h2>Number of textures</h2>
@@ -159,13 +164,17 @@ def robustness_rows(table: dict) -> list[list[str]]:
 
 
 def _pictures(folder: Path, entries: dict, counted: dict) -> dict[str, str]:
-    pictures = dict.fromkeys(("curves", "bars", "counts"), "")
+    pictures = dict.fromkeys(("curves", "bars", "reliability", "counts"), "")
     if entries:
         write_study_curves(folder / "curves.png", {label: entry["thresholds"] for label, (_, entry) in entries.items()})
         write_texture_bars(
             folder / "textures.png", {label: entry["per_style"] for label, (_, entry) in entries.items()}
         )
         pictures |= {"curves": embedded(folder / "curves.png"), "bars": embedded(folder / "textures.png")}
+    reliabilities = {label: e["all"]["reliability"] for label, (_, e) in entries.items() if "reliability" in e["all"]}
+    if reliabilities:
+        write_reliability(folder / "reliability.png", reliabilities)
+        pictures["reliability"] = embedded(folder / "reliability.png")
     if counted:
         write_texture_counts(folder / "texture_counts.png", {name: study["rows"] for name, study in counted.items()})
         pictures["counts"] = embedded(folder / "texture_counts.png")

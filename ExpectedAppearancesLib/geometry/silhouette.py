@@ -14,24 +14,62 @@ class Silhouette:
 
     def __init__(self, vertices_mm: np.ndarray, triangles: np.ndarray):
         self._vertices_mm = np.asarray(vertices_mm, float)
+        self._triangles = np.asarray(triangles)
         a, b, c = (self._vertices_mm[triangles[:, i]] for i in range(3))
-        self._face_normals, self._face_points_mm = np.cross(b - a, c - a), a
+        self._middle_mm = self._vertices_mm.mean(axis=0) if len(self._vertices_mm) else np.zeros(3)
+        self._face_normals = np.cross(b - a, c - a)
+        self._face_offsets = np.einsum("ij,ij->i", self._face_normals, a - self._middle_mm)
         edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
         count = len(self._vertices_mm)
-        keys, self._edge_of_side = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
+        keys, edge_of_side = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
         self._edges = np.stack([keys // count, keys % count], axis=1)
-        self._sides = np.bincount(self._edge_of_side, minlength=len(keys))
+        self._sides = np.bincount(edge_of_side.ravel(), minlength=len(keys))
+        # The triangles at each edge, those of one edge behind one another.
+        self._triangles_at = np.argsort(edge_of_side.ravel(), kind="stable") % max(1, len(triangles))
+        self._first_at = np.cumsum(self._sides) - self._sides
 
     def edges(self, camera_from_world: np.ndarray, facing_borders_only: bool = False) -> np.ndarray:
         """(E, 2) indices of the vertices of the outline's edges, from an OpenCV pose. Hidden outlines are included.
 
         facing_borders_only: leave out border edges of triangles that turn their back, which mostly hide behind others.
         """
-        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-        towards = np.einsum("ij,ij->i", self._face_normals, centre_mm - self._face_points_mm) > 0
-        facing = np.bincount(self._edge_of_side, np.tile(towards, 3), minlength=len(self._edges))
+        return self._edges[self._is_outline(self._facing(camera_from_world), facing_borders_only)]
+
+    def edges_with_inside(self, camera_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `edges` with facing borders only, and for each edge (E,) the third vertex of a triangle at it that faces
+        the camera: the side on which the surface is seen."""
+        towards_at = self._towards_at(camera_from_world)
+        chosen = np.flatnonzero(self._is_outline(self._count(towards_at), facing_borders_only=True))
+        # At each edge the first of its triangles that faces the camera; only few edges have more than two.
+        first, sides = self._first_at[chosen], self._sides[chosen]
+        side, found = first.copy(), np.zeros(len(chosen), bool)
+        for i in range(sides.max(initial=0)):
+            new = ~found & (i < sides)
+            new[new] = towards_at[first[new] + i]
+            side[new], found = first[new] + i, found | new
+        edges = self._edges[chosen]
+        return edges, self._triangles[self._triangles_at[side]].sum(axis=1) - edges.sum(axis=1)
+
+    def _facing(self, camera_from_world: np.ndarray) -> np.ndarray:
+        """Number of triangles at each edge that face the camera."""
+        return self._count(self._towards_at(camera_from_world))
+
+    def _count(self, towards_at: np.ndarray) -> np.ndarray:
+        if not len(self._edges):
+            return np.zeros(0, np.int32)
+        return np.add.reduceat(towards_at.astype(np.int32), self._first_at)
+
+    def _towards_at(self, camera_from_world: np.ndarray) -> np.ndarray:
+        return self.towards(camera_from_world)[self._triangles_at]
+
+    def _is_outline(self, facing: np.ndarray, facing_borders_only: bool) -> np.ndarray:
         border = (self._sides == 1) & (facing >= (1 if facing_borders_only else 0))
-        return self._edges[border | ((facing > 0) & (facing < self._sides))]
+        return border | ((facing > 0) & (facing < self._sides))
+
+    def towards(self, camera_from_world: np.ndarray) -> np.ndarray:
+        """bool (F,): whether each triangle faces the camera."""
+        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+        return self._face_normals @ (centre_mm - self._middle_mm) > self._face_offsets
 
     def on_plane(self, camera_from_world: np.ndarray, plane_depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """The outline seen from the pose, drawn on the plane z = plane_depth_mm of the camera.

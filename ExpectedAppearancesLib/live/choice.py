@@ -25,6 +25,7 @@ class Choice:
     """path, device (a number, or a stream's address) or node_name: as the kind says. camera_path: '' for the case's.
 
     repeat, only_new: of files. rate_hz: of images without a speed of their own. stale_s: age at which trust ends.
+    steady: poses are filtered over time.
     """
 
     case_path: str = ""
@@ -37,6 +38,7 @@ class Choice:
     only_new: bool = False
     rate_hz: float = USUAL_RATE_HZ
     stale_s: float = 0.5
+    steady: bool = False
     frames: FrameSettings = field(default_factory=FrameSettings)
 
     @property

@@ -61,14 +61,7 @@ def open_model(case: Case) -> OpenedModel:
     camera = estimator.case_camera
     # The first pass allocates and compiles: better now than with the first frame.
     estimator.predict(np.zeros((camera.height, camera.width, 3), np.uint8))
-    return OpenedModel(estimator, device_of(estimator))
-
-
-def device_of(estimator: Estimator) -> str:
-    """Where the model runs in fact: onnxruntime falls back to the CPU when the GPU's libraries do not load."""
-    session = getattr(estimator, "_session", None)
-    providers = session.get_providers() if session is not None else []
-    return PROVIDER_NAMES.get(providers[0], providers[0]) if providers else "CPU"
+    return OpenedModel(estimator, PROVIDER_NAMES.get(estimator.provider, estimator.provider))
 
 
 def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path, Prediction]]:

@@ -40,12 +40,15 @@ class OverlayMaker:
         self._vessels = vessels
         self._silhouette = Silhouette(vessels.vertices_mm, vessels.triangles)
         sides = np.concatenate([vessels.triangles[:, [i, (i + 1) % 3]] for i in range(3)])
-        self._sign = np.where(sides[:, 0] < sides[:, 1], 1.0, -1.0)
-        self._edges, self._edge_of_side = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
-        self._edge_of_side = self._edge_of_side.ravel()
-        a, b, c = (vessels.vertices_mm[vessels.triangles[:, i]] for i in range(3))
-        self._normals, self._first_mm = np.cross(b - a, c - a), a
-        self._is_closed = bool((np.bincount(self._edge_of_side) == 2).all())
+        self._edges, edge_of_side, count = np.unique(
+            np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+        )
+        # Sides in the order of their edges: the triangle of each and its direction, and where each edge begins.
+        order = np.argsort(edge_of_side.ravel(), kind="stable")
+        self._triangle_of_side = order % max(1, len(vessels.triangles))
+        self._sign = np.where(sides[order, 0] < sides[order, 1], 1, -1).astype(np.int16)
+        self._first_side = np.cumsum(count) - count
+        self._is_closed = bool((count == 2).all())
         low, high = vessels.vertices_mm.min(axis=0), vessels.vertices_mm.max(axis=0)
         sides = list(itertools.product((0, 1), repeat=3))
         self._corners_mm = np.where(sides, high, low)
@@ -77,8 +80,7 @@ class OverlayMaker:
         near = points_mm.copy()
         near[:, 2] = np.maximum(near[:, 2], NEAREST_MM)  # of triangles that are left out; a zero would warn
         points_px = _pixels(small, near)
-        centre_mm = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-        towards = np.einsum("ij,ij->i", self._normals, centre_mm - self._first_mm) > 0
+        towards = self._silhouette.towards(camera_from_world)
         seen = self._covered(points_px, towards & in_front, small)
         if not (self._is_closed and in_front.all()):  # through holes one sees the other side
             seen |= self._covered(points_px, ~towards & in_front, small)
@@ -89,7 +91,7 @@ class OverlayMaker:
 
         Edges between two of them cancel, so that only their common outline is drawn, as a winding number.
         """
-        weight = np.bincount(self._edge_of_side[np.tile(used, 3)], self._sign[np.tile(used, 3)], len(self._edges))
+        weight = np.add.reduceat(self._sign * used[self._triangle_of_side], self._first_side)
         chosen = np.nonzero(weight)[0]
         return winding(points_px[self._edges[chosen]], weight[chosen], camera.width, camera.height) != 0
 

@@ -16,6 +16,8 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.pose import is_rigid
 from ..registration.poses_file import read_poses, write_poses
+from ..registration.tracking import TrackedPose, TrackState
+from .steady import Steadied, View
 
 if TYPE_CHECKING:
     from ..registration.predictor import Prediction
@@ -26,13 +28,20 @@ FORMAT = "ExpectedAppearances live frame"
 @dataclass(frozen=True, eq=False)
 class RecordedFrame:
     """One recorded frame; time_s: since the recording began. image_rgb may be left out (None) where only the note is
-    needed. camera is that of the image, without distortion."""
+    needed. camera is that of the image, without distortion. prediction: the frame's own pose, accepted if an overlay
+    was drawn; steadied: None where each frame stood for itself."""
 
     time_s: float
     name: str
     camera: Camera
     prediction: Prediction
     image_rgb: np.ndarray | None = None
+    steadied: Steadied | None = None
+
+    @property
+    def camera_from_world(self) -> np.ndarray | None:
+        """The pose that was drawn: the filtered one where poses were steadied."""
+        return self.steadied.camera_from_world if self.steadied else self.prediction.camera_from_world
 
 
 def to_note(frame: RecordedFrame, case_key: str) -> str:
@@ -40,7 +49,8 @@ def to_note(frame: RecordedFrame, case_key: str) -> str:
     prediction = frame.prediction
     pose = prediction.camera_from_world
     return json.dumps(
-        {
+        _steadied_note(frame)
+        | {
             "format": FORMAT,
             "case": case_key,
             "time_s": frame.time_s,
@@ -73,7 +83,10 @@ def from_note(text: str) -> tuple[RecordedFrame, str]:
             float(values["latency_ms"]),
         )
         camera = Camera.from_dict(values["camera"], "recorded frame: camera")
-        return RecordedFrame(float(values["time_s"]), str(values["name"]), camera, prediction), str(values["case"])
+        time_s, name, steadied = float(values["time_s"]), str(values["name"]), _steadied(values)
+        if steadied is not None and prediction.accepted and steadied.camera_from_world is None:
+            raise ValueError("accepted, without the pose that was drawn")
+        return RecordedFrame(time_s, name, camera, prediction, steadied=steadied), str(values["case"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"recorded frame: its note cannot be read ({error}); record again.") from error
 
@@ -98,12 +111,36 @@ def export_recording(folder: Path, frames: Iterable[RecordedFrame]) -> Path:
             )
         image = folder / "frames" / f"{number:05d}.png"
         files.write_png(image, frame.image_rgb)
-        entry = frame_record(image, frame.prediction) | {"time_s": round(frame.time_s, 4), "source": frame.name}
+        entry = frame_record(image, frame.prediction) | _steadied_note(frame)
+        entry |= {"time_s": round(frame.time_s, 4), "source": frame.name}
         entries.append(entry | {"confidence": _known(frame.prediction.confidence)})
     if not entries:
         raise InputError("recording: there is no frame to export; record some first.")
     write_poses(folder / "poses.json", camera, entries)
     return folder / "poses.json"
+
+
+def _steadied_note(frame: RecordedFrame) -> dict:
+    """The filtered pose beside the frame's own, with the keys that `register --track` writes."""
+    from ..registration.record import tracking_record
+
+    if frame.steadied is None:
+        return {}
+    record = tracking_record(frame.steadied.tracked)
+    record["tracking"]["view"] = frame.steadied.view.value
+    return record
+
+
+def _steadied(values: dict) -> Steadied | None:
+    if "tracking" not in values:
+        return None
+    tracking, pose = values["tracking"], values["tracked_camera_from_world"]
+    pose = None if pose is None else np.array(pose, float)
+    if pose is not None and not is_rigid(pose):
+        raise ValueError("its filtered pose is not rigid")
+    covariance = None if tracking["covariance"] is None else np.array(tracking["covariance"], float)
+    used = tracking["used"] is True and pose is not None
+    return Steadied(View(tracking["view"]), TrackedPose(pose, covariance, TrackState(tracking["state"]), used))
 
 
 def _known(confidence: float) -> float | None:

@@ -22,6 +22,7 @@ from .feed import Feed, FeedState, FeedStatus
 from .frames import FramePreparation, FrameSettings, LiveFrame
 from .overlay import Overlay, OverlayMaker
 from .sources import Source
+from .steady import Steadied, Steadying, can_steady
 from .trust import Shown, Sight, Verdict, judge
 from .worker import NewestWins, WorkerCounts
 
@@ -34,7 +35,8 @@ class LiveResult:
     """One frame with all that belongs to it.
 
     image_rgb, camera: as prepared, without distortion; None when the frame could not be used, and problem says why.
-    overlay: None unless the pose is accepted and in view. done_s: when it was ready (monotonic).
+    overlay: None unless the pose is accepted and in view. done_s: when it was ready (monotonic). steadied: what the
+    frames before it make of its pose; None where each frame stands for itself.
     """
 
     frame: LiveFrame
@@ -45,6 +47,14 @@ class LiveResult:
     overlay: Overlay | None = None
     problem: str = ""
     done_s: float = math.nan
+    steadied: Steadied | None = None
+
+    @property
+    def camera_from_world(self) -> np.ndarray | None:
+        """The pose that is drawn if any is: the filtered one where poses are steadied, else the frame's own."""
+        if self.steadied is not None:
+            return self.steadied.camera_from_world
+        return self.prediction.camera_from_world if self.prediction else None
 
     @property
     def accepted(self) -> bool:
@@ -57,7 +67,8 @@ class LiveResult:
 
     def shown(self) -> Shown:
         confidence = self.prediction.confidence if self.prediction else 0.0
-        return Shown(self.frame.taken_s, self.case_key, self.accepted, confidence, self.problem)
+        view = self.steadied.view if self.steadied else None
+        return Shown(self.frame.taken_s, self.case_key, self.accepted, confidence, self.problem, view)
 
 
 @dataclass(frozen=True)
@@ -79,7 +90,8 @@ class Update:
 class LiveSession:
     """Registers frames of one case. Start it, feed it (`start`, or `push` for frames from the scene), tick it, stop it.
 
-    camera: of the frames as they come; the case's if None. stale_s: age from which a frame is not trusted.
+    camera: of the frames as they come; the case's if None. stale_s: age from which a frame is not trusted. steady:
+    whether poses are filtered over time; not those of single steps, of files, and of models without covariance.
     """
 
     def __init__(
@@ -92,8 +104,9 @@ class LiveSession:
         clock: Callable[[], float] = time.monotonic,
     ):
         self.case_key = case_key(case)
-        self.stale_s = stale_s
+        self.stale_s, self.steady = stale_s, False
         self._clock, self._estimator = clock, estimator
+        self._steadying: Steadying | None = None
         self._preparation = FramePreparation(camera or case.camera, settings)
         self._overlays = OverlayMaker(case.vessels)
         self._worker: NewestWins[LiveFrame, LiveResult] = NewestWins(self._register)
@@ -181,16 +194,30 @@ class LiveSession:
 
     def _register(self, frame: LiveFrame) -> LiveResult:
         """In the worker's thread: everything that costs time."""
-        image = camera = prediction = overlay = None
+        image = camera = prediction = overlay = steadied = None
         problem = ""
         try:
             image, camera = self._preparation.prepare(frame.image_rgb)
             prediction = frame.given
             if prediction is None and self._estimator is not None:
                 prediction = self._estimator.predict(image, camera)
-            if prediction is not None and prediction.accepted and prediction.camera_from_world is not None:
-                overlay = self._overlays.make(camera, prediction.camera_from_world)
+            steadied = self._steadied(frame, prediction)
+            pose = prediction.camera_from_world if prediction is not None and prediction.accepted else None
+            if steadied is not None:
+                pose = steadied.camera_from_world
+            if pose is not None:
+                overlay = self._overlays.make(camera, pose)
         except ExpectedAppearancesError as error:
             problem, prediction, overlay = str(error), None, None
+            steadied = self._steadied(frame, None)
         bare = replace(frame, image_rgb=np.empty((0, 0, 3), np.uint8)) if image is not None else frame
-        return LiveResult(bare, self.case_key, image, camera, prediction, overlay, problem, self._clock())
+        return LiveResult(bare, self.case_key, image, camera, prediction, overlay, problem, self._clock(), steadied)
+
+    def _steadied(self, frame: LiveFrame, prediction: Prediction | None) -> Steadied | None:
+        """In the worker's thread, which alone touches the filter."""
+        if not self.steady or self._single or frame.given is not None or not can_steady(self._estimator):
+            self._steadying = None
+            return None
+        if self._steadying is None:
+            self._steadying = Steadying(self._estimator.encoding.centre_world_mm)
+        return self._steadying.update(frame.taken_s, prediction)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from .feed import FeedState
+from .steady import View
 
 
 class Sight(Enum):
@@ -23,22 +24,26 @@ class Sight(Enum):
     FAILED = "failed"  # the registration itself ended with an error
     STALE = "stale"  # too old
     REFUSED = "refused"  # a pose that must not be believed, or none
+    VIEW_LOST = "view lost"  # so for a while, where poses are steadied
     FROZEN = "frozen"  # accepted, but held by the user
     FOLLOWING = "following"  # accepted and new
+    FOUND = "found again"  # the same, just after the view was lost
 
 
-SHOWS_OVERLAY = frozenset({Sight.FOLLOWING, Sight.FROZEN})
+SHOWS_OVERLAY = frozenset({Sight.FOLLOWING, Sight.FOUND, Sight.FROZEN})
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The frame on the screen: when it was taken, and what registration said about it."""
+    """The frame on the screen: when it was taken, and what registration said about it. view: None where poses are not
+    steadied."""
 
     taken_s: float
     case_key: str
     accepted: bool
     confidence: float
     problem: str = ""
+    view: View | None = None
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,9 @@ def judge(
         return Verdict(Sight.STALE, age_s, feed_problem)
     if shown.problem:
         return Verdict(Sight.UNUSABLE, age_s, shown.problem)
-    return Verdict(Sight.FOLLOWING if shown.accepted else Sight.REFUSED, age_s)
+    if not shown.accepted:
+        return Verdict(Sight.VIEW_LOST if shown.view is View.LOST else Sight.REFUSED, age_s)
+    return Verdict(Sight.FOUND if shown.view is View.FOUND else Sight.FOLLOWING, age_s)
 
 
 @dataclass(frozen=True)

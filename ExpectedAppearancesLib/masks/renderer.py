@@ -68,7 +68,7 @@ class MaskRenderer:
         self._window.AddRenderer(self._renderer)
         for mesh, label in ((parenchyma, PARENCHYMA), (vessels, VESSELS)):
             mapper = vtk.vtkPolyDataMapper()
-            mapper.SetInputData(mesh.to_polydata())
+            mapper.SetInputData(mesh.to_polydata(normals=False))
             mapper.ScalarVisibilityOff()
             actor = vtk.vtkActor()
             actor.SetMapper(mapper)

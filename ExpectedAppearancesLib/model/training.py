@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from .. import files
 from ..appearances.store import folder_of, read_appearances
+from ..cancelling import cancelling_waits
 from ..case.case import Case
 from ..case.meshes import write_vtp
 from ..devices import fast_dtype
@@ -23,6 +25,7 @@ from ..evaluation.metrics import add_mm
 from ..masks.exposed import exposed_vessels
 from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error
+from ..registration.contrast import SHARPER, ContrastAligner
 from ..registration.covariance import CovarianceModel, calibrate_covariance, correlated, pose_error
 from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
 from ..registration.predictor import EXPOSED_VESSELS_NAME
@@ -70,6 +73,8 @@ def train_case(
     if fold and fold.poses_path:
         views = replace(views, poses_file=str(Path(fold.poses_path).absolute()))
     validation_views = replace(views, styles=tuple(held_out or styles), negatives=0.0, seed=seed + 1001)
+    if preset.estimator == "dense":  # frames are sharper than what the network reads of them, and poses refined on them
+        validation_views = replace(validation_views, size_px=SHARPER * preset.size_px)
     poses = np.stack([sampler_of(case, seed + 1).sample(i) for i in range(400)])
     encoding = fit_encoding(poses, case.vessels.centroid_mm, case.vessels.radius_mm)
     folder = fold.folder if fold else case.model_folder
@@ -131,6 +136,8 @@ class _Trainer:
         craniotomy = craniotomy_of(case)
         self.exposed = exposed_vessels(case.vessels, parenchyma_of(case, craniotomy), craniotomy.outward_axis)
         self.aligner = VesselAligner(self.exposed.vertices_mm, self.exposed.triangles, self.camera)
+        sharp = network_camera(case.camera, SHARPER * preset.size_px)
+        self.contrast = ContrastAligner(self.exposed.vertices_mm, self.exposed.triangles, sharp)
         ranges = sampler_of(case, 0).ranges
         distance = ranges.working_distance_mm
         self.plausible = PlausibleView(
@@ -161,11 +168,13 @@ class _Trainer:
         use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
-        with Feeder(self.case.folder, self.views, preset.fresh, first, _feeder_workers(self.device)) as feeder:
+        workers = _feeder_workers(self.device)
+        with Feeder(self.case.folder, self.views, preset.fresh, first, workers) as feeder, cancelling_waits() as stop:
             memory = ViewMemory(feeder, preset.batch, preset.remembered, self.views.seed)
             while True:
                 done = max(state["step"] / preset.steps, state["seconds"] / 60 / preset.minutes)
-                if done >= 1:
+                if done >= 1 or stop.asked:
+                    self._save()
                     break
                 batch = memory.next(state["step"])
                 state["drawn"] = first + memory.drawn
@@ -173,7 +182,7 @@ class _Trainer:
                     group["lr"] = self._learning_rate(done)
                 self.network.train()
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16):
-                    output = self.network(self._images(batch), *self._rendered(batch))
+                    output = self.network(self._images(batch.images), *self._rendered(batch))
                 loss = self._loss(output, batch)
                 self.optimizer.zero_grad(set_to_none=True)
                 loss.backward()
@@ -243,8 +252,8 @@ class _Trainer:
         export_model(self.network.cpu(), self.preset, meta, self.folder)
         return figures
 
-    def _images(self, batch: Batch) -> torch.Tensor:
-        images = torch.from_numpy(batch.images).to(self.device).permute(0, 3, 1, 2).float() / 255
+    def _images(self, images_rgb: np.ndarray) -> torch.Tensor:
+        images = torch.from_numpy(images_rgb).to(self.device).permute(0, 3, 1, 2).float() / 255
         return images.contiguous(memory_format=torch.channels_last)
 
     def _rendered(self, batch: Batch) -> tuple[torch.Tensor, ...]:
@@ -299,11 +308,19 @@ class _Trainer:
     @torch.no_grad()
     def _read(self, batch: Batch) -> list[Reading]:
         self.network.eval()
-        images = self._images(batch)
-        outputs = np.concatenate([self.network(images[i : i + 32]).cpu().numpy() for i in range(0, len(images), 32)])
+        outputs = []
+        for i in range(0, len(batch.images), 32):
+            images = self._images(batch.images[i : i + 32])
+            if self.preset.estimator == "dense":
+                images = F.avg_pool2d(images, SHARPER)
+            outputs.append(self.network(images).cpu().numpy())
+        outputs = np.concatenate(outputs)
         if self.preset.estimator == "regression":
             return [read_regression(output, self.encoding) for output in outputs]
-        return [read_dense(output, self.camera, self.encoding, self.aligner) for output in outputs]
+        return [
+            read_dense(output, image, self.camera, self.encoding, self.aligner, self.contrast)
+            for output, image in zip(outputs, batch.images)
+        ]
 
     def _add(self, readings: list[Reading], batch: Batch) -> np.ndarray:
         vertices = self.case.vessels.vertices_mm[::20]

@@ -15,7 +15,7 @@ from ..appearances.projection import SurfacePainter
 from ..appearances.store import Appearance, read_appearances
 from ..augmentation import elastic, microscope
 from ..augmentation.impostors import impostor
-from ..augmentation.surroundings import fill_outside, opening
+from ..augmentation.surroundings import continue_tissue, fill_outside, opening
 from ..case.case import Case
 from ..geometry.pose import pose_from_rotation, rotation_matrix
 from ..masks.labels import BACKGROUND, VESSELS
@@ -118,7 +118,10 @@ class ViewSource:
         if hidden is not None:
             labels *= hidden
         self._clear_bars(labels, 1)
-        image = fill_outside(image, labels == BACKGROUND, cortex, rng)
+        tissue = labels != BACKGROUND
+        if hidden is None:
+            image, tissue = continue_tissue(image, tissue.astype(np.uint8), rng)
+        image = fill_outside(image, ~tissue, cortex, rng)
         return self._finish(image, pose, labels, points, rng)
 
     def close(self) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..evaluation.verdict import PROTOCOL_NAMES, Figures
 
 ROLE_ATTRIBUTE = "ExpectedAppearances.Role"
@@ -109,14 +111,17 @@ def _chart(scene, role: str, title: str, x_title: str, y_title: str, series_node
 def _fill(table_node, columns: dict[str, list]) -> None:
     """Replace the table's content at once; a column is text where a value of it is, else double."""
     import vtk
+    from vtk.util.numpy_support import numpy_to_vtk
 
     table = vtk.vtkTable()
     for title, values in columns.items():
-        text = any(isinstance(value, str) for value in values)
-        column = vtk.vtkStringArray() if text else vtk.vtkDoubleArray()
+        if any(isinstance(value, str) for value in values):
+            column = vtk.vtkStringArray()
+            for value in values:
+                column.InsertNextValue(value)
+        else:
+            column = numpy_to_vtk(np.array(values, float), deep=True)
         column.SetName(title)
-        for value in values:
-            column.InsertNextValue(value)
         table.AddColumn(column)
     table_node.SetAndObserveTable(table)
 

@@ -22,6 +22,7 @@ from ..live.frames import LiveFrame
 from ..live.overlay import OverlayMaker
 from ..live.recording import RecordedFrame, add_truth
 from ..live.session import LiveResult, LiveSession, Update
+from ..live.steady import check_can_steady
 from ..live.trust import Sight, Verdict
 from ..poses.craniotomy import find_craniotomy
 from . import live_record
@@ -141,7 +142,10 @@ class LiveController:
             self._model = model or open_model(case)
         self._registers = choice.needs_model
         estimator = self._model.estimator if choice.needs_model else None
+        if choice.steady:
+            check_can_steady(estimator, case.model_folder)
         self._session = LiveSession(case, estimator, opened.camera, choice.frames, choice.stale_s, self._clock)
+        self._session.steady = choice.steady
         self._session.start(opened.source, single or opened.still)
         if node is not None:
             self._stream = NodeFrames(self._scene, node, self._session.push, self._clock)
@@ -205,6 +209,13 @@ class LiveController:
         if self._session is not None:
             self._session.stale_s = stale_s
 
+    def set_steady(self, steady: bool) -> None:
+        """Filter the poses over time from the next frame on, or not. Raises InputError for a model that cannot."""
+        if self._session is not None and steady != self._session.steady:
+            if steady and self._registers:
+                check_can_steady(self._model.estimator, self.case.model_folder)
+            self._session.steady = steady
+
     @at_once
     def fit_views(self) -> None:
         """Show the whole frame again."""
@@ -240,7 +251,7 @@ class LiveController:
         result = self.result
         if not self.frozen or result is None or result.image_rgb is None:
             raise InputError("alignment: freeze a frame first, then align the vessels to it.")
-        start = self.truth
+        start = self.truth if self.truth is not None else result.camera_from_world
         if start is None and result.prediction is not None:
             start = result.prediction.camera_from_world
         if start is None:
@@ -281,7 +292,7 @@ class LiveController:
         self.show_truth(pose if keep else None)
         result = self.result
         if result is not None and result.accepted and self.live is not None:
-            self.live.set_pose(result.prediction.camera_from_world)  # what was predicted is what the views follow
+            self.live.set_pose(result.camera_from_world)  # what was predicted is what the views follow
 
     @at_once
     def show_truth(self, camera_from_world: np.ndarray | None) -> None:
@@ -296,11 +307,9 @@ class LiveController:
     def difference(self) -> PoseDifference | None:
         """Of the predicted pose of the frame on the screen from its true one."""
         result = self.result
-        if self.truth is None or result is None or result.prediction is None:
+        if self.truth is None or result is None or result.camera_from_world is None:
             return None
-        if result.prediction.camera_from_world is None:
-            return None
-        return compare(self.case.vessels.vertices_mm, self.truth, result.prediction.camera_from_world, result.camera)
+        return compare(self.case.vessels.vertices_mm, self.truth, result.camera_from_world, result.camera)
 
     def save_truth(self, folder: Path) -> Path:
         """Add the frame with its true pose to folder/poses.json. Raises InputError."""
@@ -334,14 +343,16 @@ class LiveController:
         live_record.put_back(browser, self.live)
         changed = self.live.take_replayed(frame.camera)
         if verdict.shows_overlay:
-            pose = frame.prediction.camera_from_world
+            pose = frame.camera_from_world
             self.live.set_pose(pose)
             overlay = self._overlays.make(frame.camera, pose)
             if overlay is None:
                 verdict = Verdict(Sight.REFUSED)
             else:
                 self.live.draw(overlay, frame.camera)
-        result = LiveResult(_frame_of(frame), recorded_key, None, frame.camera, frame.prediction)
+        result = LiveResult(
+            _frame_of(frame), recorded_key, None, frame.camera, frame.prediction, steadied=frame.steadied
+        )
         self._set_visible(verdict.shows_overlay, changed)
         self.status = Status(verdict, result)
         return self.status
@@ -402,7 +413,7 @@ class LiveController:
 
 
 def _recorded(result: LiveResult) -> RecordedFrame:
-    return RecordedFrame(0.0, result.frame.name, result.camera, result.prediction, result.image_rgb)
+    return RecordedFrame(0.0, result.frame.name, result.camera, result.prediction, result.image_rgb, result.steadied)
 
 
 def _frame_of(frame: RecordedFrame) -> LiveFrame:

@@ -6,6 +6,7 @@ All is saved with the scene by Slicer itself. Replaying puts a frame, its transf
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,14 @@ class Recorder:
             time_s,
             result.frame.name,
             result.camera,
-            Prediction(prediction.camera_from_world, result.accepted, prediction.confidence, prediction.latency_ms),
+            Prediction(
+                prediction.camera_from_world,
+                result.accepted,
+                prediction.confidence,
+                prediction.latency_ms,
+                prediction.covariance,
+            ),
+            steadied=result.steadied,
         )
         self._proxies[NOTE].SetText(to_note(frame, result.case_key))
         for role, sequence in self.sequences.items():
@@ -120,7 +128,7 @@ def recorded_frames(browser, pixels: bool = True) -> Iterator[tuple[RecordedFram
         image = None
         if pixels:
             image = pixels_of(sequences[FRAME].GetNthDataNode(item).GetImageData())
-        yield RecordedFrame(frame.time_s, frame.name, frame.camera, frame.prediction, image), key
+        yield replace(frame, image_rgb=image), key
 
 
 def frame_at(browser) -> tuple[RecordedFrame, str]:
@@ -152,7 +160,7 @@ def export(browser, folder: Path, space: str) -> Path:
     folder = Path(folder)
     poses_path = export_recording(folder, (frame for frame, _key in recorded_frames(browser)))
     for number, (frame, _key) in enumerate(recorded_frames(browser, pixels=False)):
-        pose = frame.prediction.camera_from_world
+        pose = frame.camera_from_world
         if pose is not None:
             write_transform(folder / "transforms" / f"{number:05d}.tfm", camera_to_ras(pose, space))
     return poses_path

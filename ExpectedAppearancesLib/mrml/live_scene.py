@@ -81,7 +81,7 @@ class LiveScene:
         changed = self._set_geometry(result.camera, result.overlay)
         self._set_pixels(result.image_rgb, changed)
         if result.overlay is not None:
-            self.set_pose(result.prediction.camera_from_world)
+            self.set_pose(result.camera_from_world)
             self.draw(result.overlay, result.camera)
         self.set_overlay_visible(result.overlay is not None)
         self.show_truth(None, None)

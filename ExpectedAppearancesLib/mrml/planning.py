@@ -87,19 +87,22 @@ def _in_world(node, polydata):
     return mover.GetOutput()
 
 
-def craniotomy_of_markups(node, vessels: Mesh, cortex: Mesh | None, space: str) -> Craniotomy:
+def craniotomy_of_markups(
+    node, vessels: Mesh, cortex: Mesh | None, space: str, fitted_axis: np.ndarray | None = None
+) -> Craniotomy:
     """From a point (its first control point), or a closed curve around the craniotomy.
 
-    A point keeps the fitted outward axis; a curve gives its own, the normal of the plane through it. Raises InputError
-    when nothing is placed yet, or a curve is too short to have a plane.
+    A point keeps the fitted outward axis (found here where it is not given); a curve gives its own, the normal of the
+    plane through it. Raises InputError when nothing is placed yet, or a curve is too short to have a plane.
     """
     points_ras = markup_points_ras(node)
     if not len(points_ras):
         raise InputError(f"{node.GetName()}: holds no point yet; click on the cortex in the 3D view.")
     points = points_ras if space == "RAS" else transform(RAS_FROM_LPS, points_ras)
     if not node.IsA("vtkMRMLMarkupsCurveNode"):
-        return find_craniotomy(vessels, cortex, space, points[0])
-    fitted = find_craniotomy(vessels, cortex, space)
+        return find_craniotomy(vessels, cortex, space, points[0], fitted_axis)
+    if fitted_axis is None:
+        fitted_axis = find_craniotomy(vessels, cortex, space).outward_axis
     # Weighted by length: the points of a curve lie denser where its control points do.
     ends = np.roll(points, -1, axis=0)
     lengths = np.linalg.norm(ends - points, axis=1)
@@ -107,7 +110,7 @@ def craniotomy_of_markups(node, vessels: Mesh, cortex: Mesh | None, space: str) 
     if node.GetNumberOfDefinedControlPoints() < 3:
         raise InputError(f"{node.GetName()}: has fewer than 3 points; draw the curve around the whole craniotomy.")
     normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
-    if normal @ fitted.outward_axis < 0:
+    if normal @ fitted_axis < 0:
         normal = -normal
     return find_craniotomy(vessels, cortex, space, centre, normal)
 
@@ -211,12 +214,14 @@ def look_at_mask(slice_node, camera: Camera, camera_from_world, plane_mm: float,
     # Slice views sample at the corners of their pixels: with this pixel at the origin the map stays sharp.
     origin = [camera.width / 2, camera.height / 2 - 1, 0, 1]
     plane_to_camera[:, 3] = camera_from_pixel(camera, plane_mm) @ origin
-    slice_node.GetSliceToRAS().DeepCopy(_vtk_matrix(camera_to_ras(camera_from_world, space) @ plane_to_camera))
-    slice_node.UpdateMatrices()
     width_mm, height_mm = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
     view_width, view_height = slice_node.GetDimensions()[:2]
     mm_per_px = max(width_mm / max(view_width, 1), height_mm / max(view_height, 1))
+    modifying = slice_node.StartModify()  # the view answers to each change, else
+    slice_node.GetSliceToRAS().DeepCopy(_vtk_matrix(camera_to_ras(camera_from_world, space) @ plane_to_camera))
+    slice_node.UpdateMatrices()
     slice_node.SetFieldOfView(mm_per_px * view_width, mm_per_px * view_height, slice_node.GetFieldOfView()[2])
+    slice_node.EndModify(modifying)
 
 
 def look_onto(camera_node, craniotomy: Craniotomy, space: str, distance_mm: float = 200.0) -> None:

@@ -6,7 +6,9 @@ import contextlib
 
 from ..case.case import Case
 from ..case.steps import LENGTH_TOLERANCE_MM
+from ..errors import InputError
 from ..poses.sampling import PoseRanges
+from .mri import scan_of
 from .planning_session import PlanningSession
 from .scene import CORTEX, VESSELS, add_case_models
 
@@ -21,6 +23,9 @@ def adopt(session: PlanningSession, parameters, scene) -> Case | None:
         return None
     nodes = models_of(scene, case)
     parameters.vesselsNode, parameters.cortexModel = nodes[VESSELS], nodes.get(CORTEX)
+    parameters.mriVolume = None
+    with contextlib.suppress(InputError):  # all else can be worked with; the panel says that the MRI is missing
+        parameters.mriVolume = scan_of(scene, case)
     parameters.cameraSource = type(parameters.cameraSource)("file")
     parameters.calibrationPath = str(case.folder / case.manifest["inputs"]["camera"]["file"])
     stages = case.manifest["stages"]

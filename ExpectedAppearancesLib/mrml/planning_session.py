@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from ..geometry.camera import Camera, read_camera, write_camera
 from ..poses.craniotomy import Craniotomy, find_craniotomy
 from ..poses.sampling import PoseRanges, PoseSampler
 from ..textures.library import list_textures, shipped_textures_folder
-from . import planning
+from . import mri, planning
 
 MODELS = {"vessels": "vessel model", "cortex": "cortex model"}
 
@@ -32,6 +34,7 @@ class PlanningSession:
         self.reader = CaseReader()
         self.texture_digests: dict[tuple, str] = {}  # (name, version of its files) -> SHA-256, or "" without OpenCV
         self.texture_problems: dict[tuple, str] = {}
+        self.busy = False  # a run goes on: segments that are drawn on are looked at when it has ended
         self._kept: dict[str, tuple] = {}
 
     def case(self, parameters) -> Case | None:
@@ -49,7 +52,13 @@ class PlanningSession:
             return getattr(case, name) if case and (name == "vessels" or parameters.vesselsNode is None) else None
         segment_id = parameters.vesselsSegmentId if name == "vessels" else ""
         space = self.space(parameters)
-        version = (node.GetID(), segment_id, space, _version_of(node, segment_id))
+        chosen = (node.GetID(), segment_id, space)
+        kept = self._kept.get(f"mesh.{name}")
+        if self.busy and node.IsA("vtkMRMLSegmentationNode") and kept and kept[0][:3] == chosen:
+            # To make a surface of a segment takes seconds, and a run that goes on does not use it.
+            version = kept[0]
+        else:
+            version = (*chosen, _version_of(node, segment_id))
         return self._once(f"mesh.{name}", version, lambda: planning.world_mesh(node, segment_id, space))
 
     def camera(self, parameters) -> Camera:
@@ -80,10 +89,19 @@ class PlanningSession:
                 raise InputError("Choose a point or a closed curve on the cortex, or let the craniotomy be fitted.")
             # Moving a point does not change the node's time of modification, so its points tell.
             placed = (node.GetNumberOfDefinedControlPoints(), planning.markup_points_ras(node).tobytes())
+            axis = self._fitted_axis(vessels, cortex, space)
             version = (_Same(vessels), _Same(cortex), node.GetID(), placed)
-            return self._once("marked", version, lambda: planning.craniotomy_of_markups(node, vessels, cortex, space))
-        version = (_Same(vessels), _Same(cortex))
-        return self._once("fitted", version, lambda: find_craniotomy(vessels, cortex, space))
+            return self._once(
+                "marked", version, lambda: planning.craniotomy_of_markups(node, vessels, cortex, space, axis)
+            )
+        axis = self._fitted_axis(vessels, cortex, space)
+        version = (_Same(vessels), _Same(cortex), space)
+        return self._once("fitted", version, lambda: find_craniotomy(vessels, cortex, space, None, axis))
+
+    def _fitted_axis(self, vessels: Mesh, cortex: Mesh | None, space: str) -> np.ndarray:
+        """Takes a tenth of a second on a large model, and stays while a point is dragged or the vessels are moved."""
+        version = (_Same(cortex or vessels), space)
+        return self._once("axis", version, lambda: find_craniotomy(vessels, cortex, space).outward_axis)
 
     def ranges(self, parameters) -> PoseRanges:
         distance = (parameters.nearestMm, parameters.farthestMm)
@@ -204,18 +222,56 @@ class PlanningSession:
             {"size_px": parameters.sizePx, "iterations": parameters.iterations},
             parameters.preset.value,
             running,
+            self.scan_to_keep(parameters) is not None,
         )
 
     def recorded(self, parameters) -> Recorded:
         return self.reader.recorded(parameters.casePath, parameters.method.value, self.limits(parameters))
 
-    def steps(self, parameters, running: frozenset[str] = frozenset()) -> dict[str, Step]:
-        return plan_steps(self.chosen(parameters, running), self.recorded(parameters))
+    def steps(
+        self, parameters, running: frozenset[str] = frozenset(), recorded: Recorded | None = None
+    ) -> dict[str, Step]:
+        return plan_steps(self.chosen(parameters, running), recorded or self.recorded(parameters))
+
+    def prepare(self, parameters) -> Iterator[None]:
+        """Work out what `steps` needs, a piece at each step; then `steps` answers at once. Changes nothing else."""
+        case = self.case(parameters)
+        yield
+        for piece in (
+            lambda: self.mesh(parameters, "vessels"),
+            lambda: self.mesh(parameters, "cortex"),
+            lambda: self._fitted_axis(*self._meshes(parameters), self.space(parameters)),
+            lambda: self.craniotomy(parameters),
+            lambda: self.sampler(parameters),
+            lambda: case and case.vessels,
+            lambda: case and case.cortex,
+            lambda: self.changed_models(parameters),
+            lambda: self.scan_to_keep(parameters),
+            lambda: self.recorded(parameters),
+        ):
+            with contextlib.suppress(InputError):  # said by the step that it belongs to
+                piece()
+            yield
 
     def limits(self, parameters) -> Limits:
         return Limits(
             parameters.addLimitMm, parameters.acceptedLimitPercent / 100, parameters.accuracyLimitPercent / 100
         )
+
+    def scan_to_keep(self, parameters) -> dict | None:
+        """Identity of the chosen MRI where the saved case does not hold it yet; None where nothing is to be done."""
+        case, node = self.case(parameters), parameters.mriVolume
+        if case is None or node is None or not (node.GetImageData() and node.GetImageData().GetNumberOfPoints()):
+            return None
+        parent = node.GetParentTransformNode()
+        placed = tuple(mri.placement(node))
+        moved = parent.GetTransformToWorldMTime() if parent else 0
+        version = (node.GetID(), node.GetImageData().GetMTime(), placed, moved)
+        identity = self._once("mri", version, lambda: mri.scan_identity(node))
+        known = self._once(
+            "mri.known", (version, case.folder, _Same(case.manifest)), lambda: mri.is_scan_of(case, identity)
+        )
+        return None if known else identity
 
     def problems_of_new_case(self, parameters, folder: str) -> list[str]:
         """Everything that keeps the chosen inputs from being saved as a case in `folder`, at once."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.camera import Camera
-from ..geometry.pose import pose_from_rotation, rotation_matrix, transform
+from ..geometry.pose import pose_from_rotation, transform
 from .craniotomy import Craniotomy
 
 MAX_TRIES = 200
@@ -116,10 +116,10 @@ class PoseSampler:
         tilt = np.arccos(cosine)
         hinge = np.cos(azimuth) * side + np.sin(azimuth) * up
         # Tilting about an axis across the outward axis carries the upright image along without adding roll.
-        tilted = rotation_matrix(hinge * tilt)
+        tilted = _turn(hinge, tilt)
         towards_camera, image_up = tilted @ axis, tilted @ up
         roll = np.radians(rng.uniform(-ranges.roll_max_deg, ranges.roll_max_deg))
-        image_up = rotation_matrix(towards_camera * roll) @ image_up
+        image_up = _turn(towards_camera, roll) @ image_up
         rotation = np.stack([np.cross(image_up, towards_camera), -image_up, -towards_camera])
         offset = np.sqrt(rng.uniform()) * ranges.lateral_offset_mm
         angle = rng.uniform(-np.pi, np.pi)
@@ -128,3 +128,10 @@ class PoseSampler:
         middle = np.array([(self.camera.width - 1) / 2, (self.camera.height - 1) / 2, 1.0])
         target_camera_mm = np.linalg.solve(self.camera.matrix, middle) * distance
         return pose_from_rotation(rotation, target_camera_mm - rotation @ target)
+
+
+def _turn(unit_axis: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Rotation about an axis (Rodrigues' formula); poses are drawn in 3D Slicer without loading OpenCV for it."""
+    x, y, z = unit_axis
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle_rad) * skew + (1 - np.cos(angle_rad)) * (skew @ skew)

@@ -10,10 +10,11 @@ from ..geometry.camera import Camera
 from ..geometry.pose import inverse, transform
 from ..model.encoding import PoseEncoding
 from .confidence import logistic
+from .contrast import ContrastAligner
 from .pnp import PoseFit, fit_pose
 from .refinement import VesselAligner
 
-EVIDENCE = {"dense": 11, "regression": 0}  # numbers of evidence that an estimator gives
+EVIDENCE = {"dense": 15, "regression": 0}  # numbers of evidence that an estimator gives
 LEAST_CELLS = 40  # fewer cells of surface than this cannot carry a pose
 
 
@@ -63,9 +64,16 @@ def cell_pixels(grid: int) -> np.ndarray:
 
 
 def read_dense(
-    output: np.ndarray, camera: Camera, encoding: PoseEncoding, aligner: VesselAligner, seed: int = 0
+    output: np.ndarray,
+    image_rgb: np.ndarray,
+    camera: Camera,
+    encoding: PoseEncoding,
+    aligner: VesselAligner,
+    contrast: ContrastAligner,
+    seed: int = 0,
 ) -> Reading:
-    """output (6, G, G) of DenseSurfaceNet; camera: network camera of that frame; aligner: of the case's vessels."""
+    """output (6, G, G) of DenseSurfaceNet; image_rgb: the frame as the camera of `contrast` sees it, uint8; camera:
+    network camera of that frame; aligner, contrast: of the case's vessels."""
     grid = output.shape[-1]
     flat = output.reshape(6, -1).astype(np.float64)
     surface = logistic(flat[4])
@@ -78,6 +86,7 @@ def read_dense(
     if fit is None:
         return Reading(None, None)
     aligned = aligner.align(fit, output[5], output[4])
+    sharpened = contrast.align(aligned.fit, image_rgb)
     vessel = logistic(flat[5, used])
     evidence = np.array(
         [
@@ -92,9 +101,13 @@ def read_dense(
             aligned.matched,
             aligned.residual_px,
             np.log(aligned.moved_mm + 0.1),
+            sharpened.matched,
+            sharpened.residual_px,
+            np.log(sharpened.separation + 0.05),
+            np.log(sharpened.moved_mm + 0.1),
         ]
     )
-    return Reading(aligned.fit.camera_from_world, evidence, aligned.fit)
+    return Reading(sharpened.fit.camera_from_world, evidence, sharpened.fit)
 
 
 def read_regression(output: np.ndarray, encoding: PoseEncoding) -> Reading:

@@ -15,11 +15,12 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..model.encoding import PoseEncoding, network_camera
 from .confidence import Confidence
+from .contrast import SHARPER, ContrastAligner
 from .covariance import CovarianceModel
 from .decoding import PlausibleView, read_dense, read_regression
 from .refinement import VesselAligner
 
-FORMAT_VERSION = 2  # 2: the vessels lie beside the model, poses are refined on them
+FORMAT_VERSION = 3  # 3: poses are refined on the frame itself, and confidence asks how well that went
 EXPOSED_VESSELS_NAME = "exposed_vessels.vtp"
 ASPECT_TOLERANCE = 0.01
 
@@ -61,6 +62,8 @@ class Predictor:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.log_severity_level = 3
+        # Between frames its threads would wait in a loop, and take the core that draws the frame.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         providers = [
             p for p in ("CUDAExecutionProvider", "CPUExecutionProvider") if p in onnxruntime.get_available_providers()
         ]
@@ -76,7 +79,14 @@ class Predictor:
         if self.estimator == "dense":
             vessels = read_mesh(folder / EXPOSED_VESSELS_NAME, "vessels of the trained model")
             self.aligner = VesselAligner(vessels.vertices_mm, vessels.triangles, self.camera)
+            sharp = network_camera(self.case_camera, SHARPER * meta["size_px"])
+            self.contrast = ContrastAligner(vessels.vertices_mm, vessels.triangles, sharp)
         self._maps: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+
+    @property
+    def provider(self) -> str:
+        """onnxruntime's name of what the model runs on in fact: it falls back to the CPU where no GPU can be used."""
+        return self._session.get_providers()[0]
 
     @property
     def gives_covariance(self) -> bool:
@@ -90,12 +100,14 @@ class Predictor:
         """
         begin = time.perf_counter()
         camera = fitted_camera(camera or self.case_camera, image_rgb.shape[1], image_rgb.shape[0])
-        network_input = self._resample(image_rgb, camera).astype(np.float32).transpose(2, 0, 1)[None] / 255
-        output = self._session.run(None, {"image": network_input})[0][0]
         if self.estimator == "regression":
-            reading = read_regression(output, self.encoding)
+            seen = self._resample(image_rgb, camera, self.camera)
+            reading = read_regression(self._output(seen), self.encoding)
         else:
-            reading = read_dense(output, self.camera, self.encoding, self.aligner)
+            sharp = self._resample(image_rgb, camera, self.contrast.camera)
+            seen = cv2.resize(sharp, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA)
+            output = self._output(seen)
+            reading = read_dense(output, sharp, self.camera, self.encoding, self.aligner, self.contrast)
         confidence = self.confidence.probability(reading.evidence)
         pose = reading.camera_from_world
         accepted = pose is not None and confidence >= self.confidence.threshold and self.plausible.holds(pose)
@@ -104,22 +116,29 @@ class Predictor:
             covariance = self.covariance.covariance(reading.fit, self.encoding.centre_world_mm)
         return Prediction(pose, bool(accepted), confidence, (time.perf_counter() - begin) * 1000, covariance)
 
-    def _resample(self, image_rgb: np.ndarray, camera: Camera) -> np.ndarray:
-        """The frame as the network's camera would have taken it: undistorted, same centre of projection."""
-        shrink = self.camera.fx / camera.fx
+    def _output(self, image_rgb: np.ndarray) -> np.ndarray:
+        network_input = image_rgb.astype(np.float32).transpose(2, 0, 1)[None] / 255
+        return self._session.run(None, {"image": network_input})[0][0]
+
+    def _resample(self, image_rgb: np.ndarray, camera: Camera, wanted: Camera) -> np.ndarray:
+        """The frame as the camera `wanted` would have taken it: undistorted, same centre of projection."""
+        shrink = wanted.fx / camera.fx
         if shrink < 0.75:
-            # Averaged down first, since remap samples single pixels and would alias.
+            # Averaged down first, since remap samples single pixels and would alias. By whole pixels at first, as far
+            # as it goes: averaging over fractions of pixels costs ten times as much.
             size = (max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
+            times = int(0.5 / shrink)
+            if times > 1 and camera.width % times == 0 and camera.height % times == 0:
+                whole = (camera.width // times, camera.height // times)
+                image_rgb = cv2.resize(image_rgb, whole, interpolation=cv2.INTER_AREA)
             image_rgb = cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA)
             camera = camera.resized(*size)
-        key = (camera, self.camera)
+        key = (camera, wanted)
         if key not in self._maps:
             distortion = np.array(camera.distortion) if camera.is_distorted else None
-            size = (self.camera.width, self.camera.height)
+            size = (wanted.width, wanted.height)
             self._maps = {
-                key: cv2.initUndistortRectifyMap(
-                    camera.matrix, distortion, None, self.camera.matrix, size, cv2.CV_32FC1
-                )
+                key: cv2.initUndistortRectifyMap(camera.matrix, distortion, None, wanted.matrix, size, cv2.CV_32FC1)
             }
         return cv2.remap(image_rgb, *self._maps[key], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 

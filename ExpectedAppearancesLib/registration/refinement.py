@@ -22,7 +22,7 @@ SIGMA_PX = 0.6  # error of a seen edge
 INDEPENDENT = 60.0  # the whole outline counts as this many independent points: neighbours err together
 PRIOR = 100.0  # covariance of the fit is taken this many times: its pixels err together too
 ITERATIONS = 10
-UPSAMPLING = 4  # edges are found between cells
+FIELD_PX = 256  # edges are found between cells: on a raster this wide, or one of twice the cells
 
 
 @dataclass(frozen=True)
@@ -49,20 +49,21 @@ class VesselAligner:
         """Gauss-Newton from `fit`, which stays a prior. Logits (G, G), cells of 2 x 2 px of the camera's image."""
         scale = self._camera.width / 128
         field, in_view = _signed_distance(vessel_logit, surface_logit, scale)
+        finer = field.shape[1] / self._camera.width
         focal = np.array([self._camera.fx, self._camera.fy])
         principal = np.array([self._camera.cx, self._camera.cy])
         edges = self._silhouette.edges(fit.camera_from_world, facing_borders_only=True)
         edges = edges[:: len(edges) // POINTS + 1]
-        relative = self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm
+        relative = np.ascontiguousarray((self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm).T)
         rotation = first = fit.camera_from_world[:3, :3]
         position = start = rotation @ fit.centre_world_mm + fit.camera_from_world[:3, 3]
         prior = np.linalg.inv(fit.covariance * PRIOR)
         information = prior
         for _ in range(ITERATIONS):
-            turned = relative @ rotation.T
-            seen = turned + position
-            pixels = seen[:, :2] / np.maximum(seen[:, 2:], 1.0) * focal + principal
-            where = ((pixels + 0.5) * (UPSAMPLING / 2) - 0.5).astype(np.float32)[None]
+            turned = rotation @ relative
+            seen = turned + position[:, None]
+            pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
+            where = np.ascontiguousarray(((pixels + 0.5) * finer - 0.5).T, np.float32)[None]
             distance, along, down = cv2.split(
                 cv2.remap(field, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e3, 0, 0))
             )
@@ -70,11 +71,11 @@ class VesselAligner:
             distance = distance[0]
             weight = (1 - np.minimum(np.abs(distance) / (REACH_PX * scale), 1) ** 2) ** 2 * inside
             jacobian = projection_jacobian(turned, seen, focal)
-            gradient = along[0][:, None] * jacobian[:, 0] + down[0][:, None] * jacobian[:, 1]
-            weighted = gradient * (weight * INDEPENDENT / ((SIGMA_PX * scale) ** 2 * max(1, len(edges))))[:, None]
-            information = weighted.T @ gradient + prior
+            gradient = along[0] * jacobian[:, 0] + down[0] * jacobian[:, 1]
+            weighted = gradient * (weight * INDEPENDENT / ((SIGMA_PX * scale) ** 2 * max(1, len(edges))))
+            information = weighted @ gradient.T + prior
             gone = np.concatenate([rotation_vector(rotation @ first.T), position - start])
-            step = np.linalg.solve(information, -weighted.T @ distance - prior @ gone)
+            step = np.linalg.solve(information, -weighted @ distance - prior @ gone)
             rotation = rotation_matrix(step[:3]) @ rotation
             position = position + step[3:]
             if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-2:
@@ -93,17 +94,19 @@ class VesselAligner:
 
 def _signed_distance(vessel_logit, surface_logit, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 3) float32, px of the network's input: distance from the vessels' edge, negative inside, and its slope
-    along x and y; and (H, W) uint8: 1 where the surface is seen all around. H = UPSAMPLING x G."""
-    size = tuple(UPSAMPLING * n for n in vessel_logit.shape[::-1])
+    along x and y; and (H, W) uint8: 1 where the surface is seen all around. H and W are FIELD_PX, or 2 G if more."""
+    times = max(2, round(FIELD_PX / vessel_logit.shape[1]))
+    size = tuple(times * n for n in vessel_logit.shape[::-1])
+    finer = times / 2  # field pixels per pixel of the network's input
     inside = (cv2.resize(vessel_logit.astype(np.float32), size) > 0).astype(np.uint8)
     outside_px = cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     inside_px = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
-    distance = cv2.GaussianBlur((outside_px - inside_px) * np.float32(2 / UPSAMPLING), (0, 0), 1.5)
-    slope = UPSAMPLING / 2 / 8
+    distance = cv2.GaussianBlur((outside_px - inside_px) * np.float32(1 / finer), (0, 0), 1.5)
+    slope = finer / 8
     along = cv2.Sobel(distance, cv2.CV_32F, 1, 0, ksize=3, scale=slope)
     down = cv2.Sobel(distance, cv2.CV_32F, 0, 1, ksize=3, scale=slope)
     seen = (cv2.resize(surface_logit.astype(np.float32), size) > 0).astype(np.uint8)
     # The rim of what is seen looks like an edge of a vessel, and is none.
-    margin = 2 * round(3 * scale * UPSAMPLING / 2) + 1
+    margin = 2 * round(3 * scale * finer) + 1
     seen = cv2.erode(seen, np.ones((margin, margin), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return cv2.merge([distance, along, down]), seen

@@ -73,10 +73,10 @@ class Tracker:
     """One video's track. `update` with every frame in the order of time, also with those that were refused."""
 
     def __init__(self, settings: TrackerSettings):
-        from scipy.stats import chi2
+        from scipy.special import gammaincinv
 
         self.settings = settings
-        self._gate = float(chi2.ppf(settings.gate_share, 6))
+        self._gate = float(2 * gammaincinv(3, settings.gate_share))  # chi-square of 6 degrees of freedom
         self._camera_from_centred = pose_from_rotation(np.eye(3), np.asarray(settings.centre_world_mm, float))
         self.reset()
 

@@ -38,7 +38,7 @@ def close_runs(
     """End or detach what is going on; returns the state that each such run was left in.
 
     ask: called with the question when the choice is ASK, answers END or DETACH. Where nobody can be asked the runs go
-    on: nothing is lost then. Ending waits until the processes are gone, a quarter of a minute at most.
+    on: nothing is lost then. Ending waits until the processes are gone, half a minute at most.
     """
     active = going_on(runs)
     if not active:

@@ -18,10 +18,12 @@ from pathlib import Path
 from xml.sax.saxutils import escape
 
 from .. import cli
+from ..appearances.store import METHODS, newest_image
 from ..cli.progress import Progress, duration
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, CancelledError, InputError
 from .environment import MODULES
 from .output import EXIT_PREFIX, FIGURES_PREFIX
+from .processes import MARK_VARIABLE
 
 # A run of hours reports less and less often, so that its log stays small.
 LONGEST_INTERVAL_S = 5.0
@@ -91,7 +93,7 @@ class SlicerProgress(Progress):
     def __init__(self, command: str, case_folder: Path | None, stream=None):
         super().__init__(stream or sys.stdout)
         self._command, self._case_folder = command, case_folder
-        self._index_stamp = None
+        self._stamps: dict[Path, int] = {}
 
     def start(self) -> None:
         self._say(
@@ -125,17 +127,13 @@ class SlicerProgress(Progress):
 
     def _newest_image(self) -> dict:
         """Path of the newest finished appearance, and how many there are; {} where nothing is new."""
-        indices = (self._case_folder / "appearances").glob("*/index.json") if self._case_folder else ()
-        try:
-            index = max(indices, key=lambda path: path.stat().st_mtime_ns, default=None)
-            if index is None or index.stat().st_mtime_ns == self._index_stamp:
-                return {}
-            self._index_stamp = index.stat().st_mtime_ns
-            items = json.loads(index.read_text(encoding="utf-8"))["items"]
-            newest = max((index.parent / item["image"] for item in items), key=os.path.getmtime, default=None)
-        except (OSError, ValueError, KeyError, TypeError):
+        folders = [self._case_folder / "appearances" / method for method in METHODS] if self._case_folder else []
+        stamps = {folder: folder.stat().st_mtime_ns for folder in folders if folder.is_dir()}
+        if not stamps or stamps == self._stamps:
             return {}
-        return {"images": len(items)} | ({"image": str(newest)} if newest else {})
+        self._stamps = stamps
+        newest, images = newest_image(max(stamps, key=stamps.get))
+        return {"images": images, "image": str(newest)} if newest else {}
 
     def _say(self, text: str) -> None:
         # Under a Slicer that has been closed nobody reads any more; the run goes on.
@@ -164,7 +162,7 @@ def main(command: str, arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(command: str, arguments: list[str], progress: SlicerProgress) -> int:
-    from .record import exclusive
+    from .record import obey_record
     from .results import result_problem
 
     case_folder = Path(arguments[0]).absolute() if arguments and not arguments[0].startswith("-") else None
@@ -172,13 +170,10 @@ def _run(command: str, arguments: list[str], progress: SlicerProgress) -> int:
         return cli.main([command, *arguments])  # explains itself, or says what is wrong with the case
     progress._case_folder = case_folder
     progress.start()
-    try:
-        with exclusive(case_folder, command):
-            code = cli.main([command, *arguments], progress)
-            problem = result_problem(command, case_folder, thorough=True) if code == EXIT_DONE else ""
-    except InputError as error:
-        cli.say_problems(command, error.problems)
-        return EXIT_BAD_INPUT
+    if os.name == "nt" and os.environ.get(MARK_VARIABLE):
+        obey_record(case_folder, command, os.environ[MARK_VARIABLE])
+    code = cli.main([command, *arguments], progress)
+    problem = result_problem(command, case_folder, thorough=True) if code == EXIT_DONE else ""
     if problem:
         print(f"Failed: {problem}", file=sys.stderr, flush=True)
         return EXIT_FAILED

@@ -79,10 +79,11 @@ class ProcessTree:
         return list(found.values())
 
     def ask_to_end(self) -> None:
-        """SIGTERM to the first process, which ends the others itself; Windows knows no such request, so all at once."""
-        if os.name == "nt" or not self.running():
+        """SIGTERM to the first process, which ends the others itself. Windows knows no such request: there the run
+        reads in its own record that it is cancelled."""
+        if not self.running():
             self.kill()
-        else:
+        elif os.name != "nt":
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGTERM)
 

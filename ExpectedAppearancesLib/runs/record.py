@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
+import logging
+import os
 import platform
+import signal
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -12,6 +18,15 @@ from .. import files
 from ..errors import InputError
 
 FORMAT = "ExpectedAppearances run"
+LOOK_EVERY_S = 0.5
+NAMED_WITHIN_S = 2.0  # a holder of a lock has written who it is
+# What goes on under a lock of this name, in the user's words.
+NAMES = {
+    "render": "drawing of label maps",
+    "synthesize": "synthesis of other expected appearances",
+    "train": "a training",
+    "study": "a study",
+}
 
 
 @dataclass(frozen=True)
@@ -71,25 +86,97 @@ def update_record(case_folder: Path, record: RunRecord, **changes) -> RunRecord:
     return changed
 
 
+def obey_record(case_folder: Path, kind: str, mark: str) -> threading.Thread:
+    """Raise SIGTERM in this process once the record of its run says that it is cancelled: for Windows, where no other
+    process can. Returns the thread that looks."""
+
+    def look() -> None:
+        while True:
+            record = read_record(case_folder, kind)
+            if record is not None and record.mark == mark and record.cancelled:
+                signal.raise_signal(signal.SIGTERM)  # its handler is called in the main thread
+                return
+            time.sleep(LOOK_EVERY_S)
+
+    thread = threading.Thread(target=look, name="cancelled?", daemon=True)
+    thread.start()
+    return thread
+
+
 @contextlib.contextmanager
-def exclusive(case_folder: Path, name: str, timeout_s: float = 0.0) -> Iterator[None]:
-    """Hold CASE/runs/NAME.lock for the block; the system frees it when the process ends, however it ends.
+def exclusive(folder: Path, name: str, timeout_s: float = 0.0, work: str = "") -> Iterator[None]:
+    """Hold FOLDER/runs/NAME.lock for the block; the system frees it when the process ends, however it ends.
 
-    Raises InputError when somebody else holds it.
+    work: what is done, where several processes may do it together: one that does the same as the holder is let in.
+    Raises InputError, which names the holder, when somebody else holds it.
     """
-    from filelock import FileLock, Timeout
-
-    path = runs_folder(case_folder) / f"{name}.lock"
+    path = runs_folder(folder) / f"{name}.lock"
     with files.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(str(path))
-        try:
-            lock.acquire(timeout=timeout_s)
-        except Timeout:
-            raise InputError(
-                f"{case_folder}: another {name} is going on in this case; wait until it has ended, or cancel it."
-            ) from None
+        lock = _locked(path, timeout_s)
+    if lock is None:
+        holder = _holder(path)
+        if not work or holder.get("work") != work:
+            raise InputError(_occupied(folder, name, holder))
     try:
+        if lock:
+            _write_holder(path, work)
         yield
     finally:
-        lock.release()
+        if lock:
+            with contextlib.suppress(OSError):
+                _holder_path(path).unlink()
+            lock.release()
+
+
+def _locked(path: Path, timeout_s: float):
+    """The lock, held; None while another process holds it, which then has written who it is."""
+    from filelock import FileLock, Timeout
+
+    lock, deadline = FileLock(str(path)), time.monotonic() + NAMED_WITHIN_S
+    while True:
+        try:
+            lock.acquire(timeout=timeout_s)
+            return lock
+        except Timeout:
+            if _holder(path) or time.monotonic() > deadline:
+                return None
+            time.sleep(0.05)
+        except NotImplementedError:  # a network drive that knows no locks
+            logging.warning("%s: cannot be locked; see to it that nobody else works on this case", path)
+            return lock
+
+
+def _holder_path(lock_path: Path) -> Path:
+    # Beside the lock: Windows lets nobody read a file that is locked.
+    return lock_path.with_suffix(".holder.json")
+
+
+def _write_holder(lock_path: Path, work: str) -> None:
+    since = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    # Whoever cannot be named holds the lock nevertheless.
+    with contextlib.suppress(InputError):
+        files.write_json(
+            _holder_path(lock_path), {"pid": os.getpid(), "host": platform.node(), "since": since, "work": work}
+        )
+
+
+def _holder(lock_path: Path) -> dict:
+    """What the holder has written; {} where it has not yet, or only one that was killed has."""
+    try:
+        content = files.read_json(_holder_path(lock_path), "holder of a lock")
+        if content["host"] == platform.node():
+            import psutil
+
+            return content if psutil.pid_exists(content["pid"]) else {}
+        return content
+    except (InputError, ImportError, KeyError, TypeError):
+        return {}
+
+
+def _occupied(folder: Path, name: str, holder: dict) -> str:
+    who = ""
+    if holder:
+        where = "" if holder.get("host") == platform.node() else f" on {holder.get('host')}"
+        who = f" (process {holder.get('pid')}{where}, since {holder.get('since')})"
+    return f"{folder}: {NAMES.get(name, name)} is going on in it{who}; wait until it has ended, or cancel it."

@@ -18,9 +18,11 @@ def result_problem(kind: str, case_folder: Path, thorough: bool = False) -> str:
 
     thorough: hash and open the model, too; takes a second.
     """
+    folder = Path(case_folder)
+    if kind == "study":
+        return _study_problem(folder / "study" / "study.json")
     if kind not in STAGES:
         return ""
-    folder = Path(case_folder)
     try:
         stage = files.read_json(folder / "case.json", "case manifest")["stages"].get(STAGES[kind], {})
         if stage.get("done", kind == "render") is not True:
@@ -51,6 +53,15 @@ def remove_partial_files(case_folder: Path, pids: Iterable[int]) -> None:
         for path in Path(case_folder).rglob(f".*.{pid}.part*"):
             with contextlib.suppress(OSError):
                 path.unlink()
+
+
+def _study_problem(path: Path) -> str:
+    from ..evaluation.verdict import figures_of_study
+
+    try:
+        return "" if figures_of_study(files.read_json(path, "study")) else f"{path}: holds no figures; start it again."
+    except InputError as error:
+        return str(error)
 
 
 def _check_appearances(folder: Path) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import datetime
 import importlib.util
 import platform
+import sys
 import time
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 
 from .. import files
@@ -18,7 +20,8 @@ from .record import RunRecord, exclusive, read_record, update_record, write_reco
 from .results import remove_partial_files, result_problem
 from .state import RunState, RunStatus
 
-CANCEL_DEADLINE_S = 10.0  # after which the processes are no longer asked to end
+# After which the processes are no longer asked to end. A training ends its step, or validation, and saves.
+CANCEL_DEADLINE_S = 30.0
 SWEEP_DEADLINE_S = 5.0
 START_LOCK_S = 1.0
 TAIL_LINES = 8
@@ -209,6 +212,14 @@ class Run:
             how = f"ended with exit code {code}"
         tail = "".join(f"\n    {line}" for line in list(output.last_lines)[-TAIL_LINES:])
         return f"The run {how}. {KEPT}\nLog: {self.log_path}{tail}"
+
+
+def loaded_for_runs() -> Iterator[None]:
+    """Load what a start needs, a piece at each step, so that the first start takes no longer than the others."""
+    for name in NEEDED_PACKAGES:
+        if name not in sys.modules and importlib.util.find_spec(name) is not None:
+            importlib.import_module(name)
+            yield
 
 
 def _tree_of(record: RunRecord) -> processes.ProcessTree:

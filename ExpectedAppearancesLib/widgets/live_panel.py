@@ -13,6 +13,7 @@ from ..geometry.camera import Camera
 from ..live.trust import Controls, controls
 from ..mrml.live_controller import IDLE, LiveController
 from ..mrml.live_scene import OverlayOptions
+from ..mrml.mri import scan_to_show
 from . import live_install
 from .labels import set_text
 from .live_align import AlignSection
@@ -119,6 +120,11 @@ class LivePanel:
         self._problem = self._missing or self.source.problem()
         self.ui.installButton.visible = bool(self._missing)
         self.controller.set_stale(p.staleMs / 1000)
+        try:
+            self.controller.set_steady(p.steady)
+        except ExpectedAppearancesError as error:
+            p.steady = False
+            self.say(str(error))
         options = OverlayOptions(p.outline, p.fill, p.fillOpacity, p.box)
         if options != self.controller.options:
             self.controller.set_options(options)
@@ -159,9 +165,21 @@ class LivePanel:
         finally:
             qt.QApplication.restoreOverrideCursor()
         self._parameter_node.browser = None
+        self._show_scan()
         self.refresh()
         self.tick()
         return True
+
+    def _show_scan(self) -> None:
+        """The MRI that the case was planned on, unless another one is chosen."""
+        p = self._parameter_node
+        try:
+            scan = scan_to_show(slicer.mrmlScene, self.controller.case, p.mriVolume)
+        except ExpectedAppearancesError as error:  # registration does without
+            self.say(str(error))
+            return
+        if scan is not p.mriVolume:
+            p.mriVolume = scan
 
     def stop(self) -> None:
         self.controller.stop()

@@ -12,6 +12,7 @@ import slicer
 
 from ..evaluation.metrics import add_mm
 from ..live.trust import Sight
+from ..mrml.live_record import frame_at
 from ..runs import dependencies
 from . import live_texts
 
@@ -112,6 +113,8 @@ def records_and_replays(test) -> None:
         for item, wait_s in ((0, 0.0), (3, 0.0), (3, 0.3), (1, 0.0)):  # at once, and when Slicer has done the rest
             widget.ui.replaySlider.value = item
             pump(wait_s)
+            recorded = frame_at(browser)[0]
+            until(test, lambda at_s=recorded.time_s: controller.result.frame.taken_s == at_s)
             pose = controller.result.prediction.camera_from_world
             test.assertEqual(controller.live.overlay_visible, controller.result.prediction.accepted)
             if not controller.result.prediction.accepted:
@@ -206,7 +209,7 @@ def truth_of(phantom, result):
     return None if number in COVERED else phantom.pose(number / 24)
 
 
-def next_result(test, widget, ticks_ms: list | None = None, timeout_s: float = 20.0):
+def next_result(test, widget, ticks_ms: list | None = None, timeout_s: float = 60.0):
     """Let Slicer work until another frame is shown; returns the status. ticks_ms: takes how long each tick was."""
     controller, seen = widget.panel.controller, widget.panel.controller.result
     end = time.monotonic() + timeout_s
@@ -220,6 +223,16 @@ def next_result(test, widget, ticks_ms: list | None = None, timeout_s: float = 2
             return controller.status
     test.fail(f"no frame came: {controller.status}")
     return None
+
+
+def until(test, condition, timeout_s: float = 60.0) -> None:
+    """Let Slicer work until the condition holds."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > end:
+            test.fail("did not happen in time")
+        slicer.app.processEvents()
+        time.sleep(0.005)
 
 
 def pump(seconds: float) -> None:

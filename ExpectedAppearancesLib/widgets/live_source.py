@@ -34,6 +34,7 @@ class SourceSection:
             only_new=p.onlyNew,
             rate_hz=p.rateHz,
             stale_s=p.staleMs / 1000,
+            steady=p.steady,
             frames=FrameSettings(p.flipRows, p.cropBorders, p.longestPx),
         )
 

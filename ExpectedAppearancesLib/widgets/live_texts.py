@@ -13,6 +13,7 @@ from ..mrml.live_controller import Status
 GREEN, AMBER, RED, GREY = (0.05, 0.50, 0.20), (0.72, 0.45, 0.0), (0.75, 0.08, 0.10), (0.35, 0.37, 0.40)
 COLOURS = dict.fromkeys(Sight, RED) | {
     Sight.FOLLOWING: GREEN,
+    Sight.FOUND: GREEN,
     Sight.FROZEN: AMBER,
     Sight.IDLE: GREY,
     Sight.WAITING: GREY,
@@ -31,8 +32,10 @@ def _headlines() -> dict[Sight, str]:
         Sight.FAILED: _("NO OVERLAY: registration failed"),
         Sight.STALE: _("NO OVERLAY: frame too old"),
         Sight.REFUSED: _("NO OVERLAY: pose refused"),
+        Sight.VIEW_LOST: _("NO OVERLAY: view lost"),
         Sight.FROZEN: _("FROZEN: not live"),
         Sight.FOLLOWING: _("FOLLOWING"),
+        Sight.FOUND: _("FOLLOWING: found again"),
     }
 
 
@@ -45,8 +48,10 @@ def _details() -> dict[Sight, str]:
         Sight.OTHER_CASE: _("These frames were registered to the vessels of another case. Open that case."),
         Sight.STALE: _("No new frame has come in time. The picture on the screen is not the present."),
         Sight.REFUSED: _("The vessels were not found with enough confidence. Clear the view, or focus again."),
+        Sight.VIEW_LOST: _("No overlay until three frames within a second agree on where the vessels are."),
         Sight.FROZEN: _("The overlay belongs to this frame. Press Freeze again to go on."),
         Sight.FOLLOWING: _("The overlay belongs to the newest frame. Not for clinical use."),
+        Sight.FOUND: _("The view was lost and is found again. Compare the overlay with what you see."),
     }
 
 
@@ -64,13 +69,20 @@ def detail(status: Status) -> str:
         return verdict.detail
     if verdict.sight is Sight.FROZEN and status.result is not None and status.result.image_rgb is None:
         return _("A recorded frame, with the pose that it had.")
+    if verdict.sight is Sight.REFUSED and _disagrees(status.result):
+        return _("This frame's pose does not fit those before it, so it is not shown.")
     return _details().get(verdict.sight, "")
+
+
+def _disagrees(result) -> bool:
+    """Whether the pose was good enough by itself, and left out where poses are steadied."""
+    return result is not None and result.steadied is not None and bool(result.prediction) and result.prediction.accepted
 
 
 def banner(status: Status) -> str:
     """Over the frame: the headline, with the number that stands behind it."""
     text = headline(status)
-    if status.verdict.sight is Sight.FOLLOWING and status.confidence is not None:
+    if status.verdict.sight in (Sight.FOLLOWING, Sight.FOUND) and status.confidence is not None:
         return _("{headline}  {percent} %").format(headline=text, percent=round(100 * status.confidence))
     if status.verdict.sight is Sight.STALE and 1 <= status.verdict.age_s < math.inf:
         # In whole seconds: the views are drawn again with each new text.

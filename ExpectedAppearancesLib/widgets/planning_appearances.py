@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import qt
 from slicer.i18n import tr as _
 
 from ..case.steps import StepState
 from ..gpus import device_arguments
-from ..textures.library import LABELS_SUFFIX
-from .planning_run import RunControls, started
+from .planning_run import RunControls, in_the_way, started
 from .planning_section import Section
 
 NEWEST_PX = 220
-CONTACT_SHEET = "contact_sheet.png"  # lies beside them
 
 
 class AppearancesSection(Section):
@@ -48,9 +43,7 @@ class AppearancesSection(Section):
             before = self.panel.steps[name]
             if before.state in (StepState.STALE, StepState.MISSING):
                 problem = problem or before.text
-        problem = problem or self.panel.help.reason("training")
-        if self.panel.runs["train"].active:
-            problem = _("The model is being trained; cancel that first.")
+        problem = in_the_way(self.panel, "synthesize") or problem or self.panel.help.reason("training")
         index = self.panel.recorded.index
         self.controls.refresh(problem, unfinished=bool(index and not index["done"]), said=step.text)
         self._show_newest(p)
@@ -79,29 +72,17 @@ class AppearancesSection(Section):
         return [*options, "--size", str(p.sizePx), "--iterations", str(p.iterations), *device], environment
 
     def _show_newest(self, p) -> None:
-        """The image that was finished last; files appear whole."""
+        """The image that was finished last."""
         case = self.session.case(p)
-        path, count = newest_image(case.appearances_folder / p.method.value) if case else (None, 0)
+        path, count = self.session.reader.newest_image(case, p.method.value) if case else (None, 0)
         self.ui.newestImage.visible = path is not None
         if path is None or (path, count) == self._shown:
             return
         self._shown = (path, count)
-        picture = qt.QPixmap(path)
+        picture = qt.QPixmap(str(path))
         if picture.isNull():
             return
         self.ui.newestImage.setPixmap(
             picture.scaled(NEWEST_PX, NEWEST_PX, qt.Qt.KeepAspectRatio, qt.Qt.SmoothTransformation)
         )
-        self.ui.newestImage.toolTip = _("{name}, the newest of {count}").format(name=Path(path).name, count=count)
-
-
-def newest_image(folder: Path) -> tuple[str | None, int]:
-    """Path of the appearance that was written last, and how many there are."""
-    try:
-        with os.scandir(folder) as entries:
-            images = [entry for entry in entries if entry.name.endswith(".png") and entry.name[0] != "."]
-            images = [e for e in images if not e.name.endswith(LABELS_SUFFIX) and e.name != CONTACT_SHEET]
-            newest = max(images, key=lambda entry: entry.stat().st_mtime_ns, default=None)
-            return (newest.path if newest else None), len(images)
-    except OSError:
-        return None, 0
+        self.ui.newestImage.toolTip = _("{name}, the newest of {count}").format(name=path.name, count=count)

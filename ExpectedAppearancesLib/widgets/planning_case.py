@@ -14,7 +14,8 @@ from slicer.i18n import tr as _
 from ..case.case import MANIFEST_NAME
 from ..case.steps import StepState
 from ..errors import InputError
-from .planning_qt import Child, allow, library_command, problems_in, quiet
+from ..mrml.mri import keep_scan
+from .planning_qt import Child, allow, library_command, problems_in, quiet, wait_cursor
 from .planning_section import NodeWatch, Section, changed
 
 # Of models, segmentations and the transforms above them.
@@ -52,7 +53,7 @@ class CaseSection(Section):
         reason = ""
         if self._saving:
             reason = _("The case is being saved.")
-        elif self.step.state is StepState.DONE and self.panel.steps["microscope"].state is StepState.DONE:
+        elif self._saved() and self.session.scan_to_keep(p) is None:
             reason = _("The case is saved; nothing has changed since.")
         elif self.panel.busy():
             reason = _("A run is going on in this case; wait until it has ended, or cancel it.")
@@ -62,6 +63,10 @@ class CaseSection(Section):
             reason = _("Choose the vessel model first.")
         for button in (self.ui.saveCaseButton, self.ui.saveMicroscopeButton):
             allow(button, reason, _(SAVE_HINT))
+
+    def _saved(self) -> bool:
+        """Whether the case holds all that anything is made from."""
+        return all(self.panel.steps[name].state is StepState.DONE for name in ("case", "microscope"))
 
     def close(self) -> None:
         for watch in self._watches.values():
@@ -108,6 +113,11 @@ class CaseSection(Section):
         if node is not None and self.parameters is not None and not self.panel.loading:
             slicer.util.setSliceViewerLayers(background=node)
 
+    def show_scan(self) -> None:
+        """Show the MRI of a case that was opened."""
+        if self.parameters.mriVolume and slicer.app.layoutManager():
+            slicer.util.setSliceViewerLayers(background=self.parameters.mriVolume, fit=True)
+
     def on_new(self, folder: str = "") -> None:
         """Choose where the case will be; it is written when it is saved."""
         if not folder:
@@ -136,6 +146,9 @@ class CaseSection(Section):
     def save(self) -> None:
         """Write the case, in a process of its own. A case that is there already is kept under another name."""
         p = self.parameters
+        if self._saved():
+            self._keep_scan()
+            return
         problems = self.session.problems_of_new_case(p, p.casePath)
         if problems:
             self._tell(problems)
@@ -198,6 +211,19 @@ class CaseSection(Section):
             )
             return
         self.panel.open_folder(str(folder))
+        self._keep_scan()
+
+    def _keep_scan(self) -> None:
+        """Add the chosen MRI to the case, where it is not in it."""
+        p = self.parameters
+        try:
+            identity = self.session.scan_to_keep(p)
+            if identity is not None:
+                with wait_cursor():
+                    keep_scan(self.session.case(p), p.mriVolume, identity)
+        except InputError as error:
+            self._tell(error.problems)
+        self.panel.refresh()
 
     def _tell(self, problems: list[str]) -> None:
         slicer.util.errorDisplay(

@@ -16,12 +16,13 @@ from ..mrml import planning
 from ..mrml.planning_adopt import adopt
 from ..mrml.planning_session import PlanningSession
 from ..runs.closing import OnClose, close_runs, going_on, question
+from ..runs.runner import loaded_for_runs
 from ..runs.state import RunState, RunStatus
 from .planning_appearances import AppearancesSection
 from .planning_case import CaseSection, MicroscopeSection
 from .planning_help import HelpSection
 from .planning_poses import PosesSection
-from .planning_qt import quiet, single_shot
+from .planning_qt import Stepper, quiet, single_shot
 from .planning_run import RunWatch
 from .planning_textures import TexturesSection
 from .planning_training import TrainingSection
@@ -37,7 +38,7 @@ SECTIONS = (
     TrainingSection,
     ValidationSection,
 )
-SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training"}
+SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training", "study": "validation"}
 
 
 class PlanningPanel:
@@ -51,7 +52,8 @@ class PlanningPanel:
         self.recorded = Recorded()
         self._followed: str | None = None
         self._next = ""
-        self._timer = single_shot(REFRESH_MS, self.refresh)
+        self._timer = single_shot(REFRESH_MS, self._refresh_in_pieces)
+        self._stepper = Stepper()
         self._ending: list = []  # runs of a closed scene that are being ended
         self._ending_timer = qt.QTimer()
         self._ending_timer.setInterval(500)
@@ -65,6 +67,7 @@ class PlanningPanel:
         self.parameters = parameters
         if parameters is None:
             self._timer.stop()
+            self._stepper.stop()
             return
         self.loading = True
         try:
@@ -91,6 +94,7 @@ class PlanningPanel:
         """The widget is destroyed: runs go on and are found again by the next panel."""
         self.exit()
         self._timer.stop()
+        self._stepper.stop()
         self._ending_timer.stop()
         for watch in self.runs.values():
             watch.forget()
@@ -104,8 +108,9 @@ class PlanningPanel:
             self._timer.start()
 
     def refresh(self) -> None:
-        """Work out the steps and show them. Everything in here is cheap, or kept from the last time."""
+        """Work out the steps and show them, at once. `refresh_soon` does it between the events of the GUI."""
         self._timer.stop()
+        self._stepper.stop()
         if self.parameters is None:
             return
         if self._followed != self.parameters.casePath:
@@ -114,13 +119,26 @@ class PlanningPanel:
                 watch.follow(self._followed)
         if not self.entered:
             return
-        self.steps = self.session.steps(self.parameters, self.running())
+        self.session.busy = self.busy()
         self.recorded = self.session.recorded(self.parameters)
+        self.steps = self.session.steps(self.parameters, self.running(), self.recorded)
         for section in self.sections.values():
             section.refresh()
             section.show_step()
         self.help.refresh()
         self._show_next()
+
+    def _refresh_in_pieces(self) -> None:
+        """What is large is looked at piece by piece, so that no call takes long."""
+
+        def pieces():
+            if self.entered:
+                self.session.busy = self.busy()
+                yield from self.session.prepare(self.parameters)
+                yield from loaded_for_runs()
+            self.refresh()  # the last: it stops what is still to be done
+
+        self._stepper.start(pieces())
 
     def running(self) -> frozenset[str]:
         return frozenset(kind for kind, watch in self.runs.items() if watch.active)
@@ -145,6 +163,8 @@ class PlanningPanel:
             finally:
                 self.loading = False
         self.refresh()
+        if take_over:
+            self.sections["case"].show_scan()
         self.unfold(self._next)
 
     def _look_at_case(self) -> None:
@@ -206,6 +226,8 @@ class PlanningPanel:
         if status.state is RunState.DONE and self.entered:
             self.refresh()
             self._go_on_from(SECTION_OF_KIND[kind])
+            if kind == "study":
+                self.sections["validation"].on_show()
         self.refresh_soon()
 
     def _show_next(self) -> None:

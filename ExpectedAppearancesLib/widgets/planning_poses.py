@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..mrml import planning
 from ..poses.craniotomy import disc_under_vessels
 from .planning_qt import Stepper, allow, quiet, single_shot
-from .planning_run import RunControls, started
+from .planning_run import RunControls, in_the_way, started
 from .planning_section import NodeWatch, Section, changed
 
 SHOWN_CAMERAS = 40
@@ -78,6 +78,7 @@ class PosesSection(Section):
             blocked = self.step.text
         elif self.panel.steps["case"].state.value == "stale":
             blocked = _("Save the case first: {reason}").format(reason=self.panel.steps["case"].text)
+        blocked = in_the_way(self.panel, "render") or blocked
         self.controls.refresh(blocked, unfinished=False, said=self.step.text)
 
     def _show_automatic(self, p, sampler) -> None:

@@ -68,6 +68,15 @@ def quiet(*widgets) -> Iterator[None]:
             widget.blockSignals(blocked)
 
 
+@contextlib.contextmanager
+def wait_cursor() -> Iterator[None]:
+    qt.QApplication.setOverrideCursor(qt.Qt.WaitCursor)
+    try:
+        yield
+    finally:
+        qt.QApplication.restoreOverrideCursor()
+
+
 class Stepper:
     """Works a generator off in pieces of some 30 ms between the events of the GUI, without a thread: MRML has one."""
 

@@ -18,6 +18,13 @@ from .planning_qt import allow
 
 POLL_MS = 500
 START_TEXTS = {"start": "Start", "continue": "Continue", "again": "Make again"}
+# Why nothing else can be started while a run of this kind goes on: all of them work on the same files.
+GOING_ON = {
+    "render": "Label maps are being drawn; wait until they are ready, or cancel that first.",
+    "synthesize": "Expected appearances are being made; wait until they are ready, or cancel that first.",
+    "train": "The model is being trained; wait until it is ready, or cancel that first.",
+    "study": "A study is going on; wait until it is ready, or cancel it first.",
+}
 
 
 class RunWatch:
@@ -78,10 +85,19 @@ class RunWatch:
 class RunControls:
     """Start and cancel button, progress bar and line of text, kept up to date with a RunWatch."""
 
-    def __init__(self, watch: RunWatch, start_button, cancel_button, bar, label, start_hint: str, noun: str = ""):
+    def __init__(
+        self,
+        watch: RunWatch,
+        start_button,
+        cancel_button,
+        bar,
+        label,
+        start_hint: str,
+        texts: dict[str, str] = START_TEXTS,
+    ):
         self.watch = watch
         self._start, self._cancel, self._bar, self._label = start_button, cancel_button, bar, label
-        self._start_hint, self._noun = start_hint, noun
+        self._start_hint, self._texts = start_hint, texts
 
     def refresh(self, problem: str, unfinished: bool, said: str = "") -> None:
         """problem: why no run can begin, '' if nothing is in the way. said: what the section's status line says."""
@@ -89,7 +105,7 @@ class RunControls:
         state = controls(status.state, problem, unfinished)
         allow(self._start, state.start, self._start_hint)
         allow(self._cancel, state.cancel, _("End the run. What is finished is kept."))
-        set_text(self._start, _(START_TEXTS[state.action]))
+        set_text(self._start, _(self._texts[state.action]))
         self._bar.visible = self.watch.active
         self._bar.value = round(100 * status.fraction)
         self._label.text = _line(status) or (problem if problem != said else "")
@@ -106,6 +122,11 @@ def _line(status: RunStatus) -> str:
         return _("Being ended…")
     # The message ends with the time left. What is done, the section says.
     return "" if status.state in (RunState.IDLE, RunState.DONE) else status.message
+
+
+def in_the_way(panel, kind: str) -> str:
+    """Why a run of this kind cannot begin because of another one, '' if none is going on."""
+    return next((_(text) for other, text in GOING_ON.items() if other != kind and panel.runs[other].active), "")
 
 
 def started(panel, watch: RunWatch, arguments: list[str], environment: dict[str, str] | None = None) -> bool:

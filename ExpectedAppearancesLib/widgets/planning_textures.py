@@ -13,16 +13,15 @@ from slicer.i18n import tr as _
 
 from .. import files
 from ..errors import InputError
-from ..masks.labels import VESSELS
-from ..textures.library import LABELS_SUFFIX, list_textures, read_texture, shipped_textures_folder
+from ..textures import thumbnails
+from ..textures.library import LABELS_SUFFIX, list_textures, shipped_textures_folder
 from .planning_case import OWN_TEXTURES
 from .planning_labelling import Labelling
-from .planning_qt import Stepper, allow, quiet
+from .planning_qt import Child, allow, library_command, quiet
 from .planning_section import Section, changed
 
-THUMBNAIL_PX = 84
+READING_MODULE = "ExpectedAppearancesLib.textures.thumbnails"
 LARGEST_PHOTOGRAPH_PX = 1024  # synthesis uses no more
-OVERLAY_RGB = (60, 220, 90)  # no tissue is green
 
 
 class TexturesSection(Section):
@@ -31,12 +30,12 @@ class TexturesSection(Section):
 
     def setup(self) -> None:
         ui = self.ui
-        self._stepper = Stepper()
+        self._child: Child | None = None
         self._pictures: dict[tuple, str] = {}  # version of a texture -> path of its thumbnail
         self._listed: list | None = None
         self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
         self.labelling = Labelling(self.panel)
-        ui.texturesList.setIconSize(qt.QSize(THUMBNAIL_PX, THUMBNAIL_PX))
+        ui.texturesList.setIconSize(qt.QSize(thumbnails.THUMBNAIL_PX, thumbnails.THUMBNAIL_PX))
         ui.texturesPathEdit.connect("currentPathChanged(QString)", self.on_path)
         ui.shippedButton.connect("clicked(bool)", lambda _checked=False: self.on_shipped())
         ui.addPhotographButton.connect("clicked(bool)", lambda _checked=False: self.on_add())
@@ -68,23 +67,54 @@ class TexturesSection(Section):
         wanted = not self.button.collapsed or self.panel.recorded.index is not None
         if wanted and versions != self._listed:
             self._listed = versions
-            self._stepper.start(self._show(found))
+            self._read(found)
 
     def leave(self) -> None:
-        self._stepper.stop()
+        self._stop_reading()
         self._listed = None
 
     def close(self) -> None:
         self.leave()
         self.labelling.stop()
 
-    def _show(self, found: dict):
-        """Read one texture at each step, then list them all."""
+    def _read(self, found: dict) -> None:
+        """List the textures once those that are new have been read, in a process of its own."""
+        self._stop_reading()
         known = self.session
-        for name, (version, image_path, labels_path) in found.items():
-            if version not in known.texture_digests and version not in known.texture_problems:
-                self._read(name, version, image_path, labels_path)
-                yield
+        new = [
+            (name, image, labels)
+            for name, (version, image, labels) in found.items()
+            if version not in known.texture_digests and version not in known.texture_problems
+        ]
+        if not new:
+            self._show(found)
+            return
+        folder = Path(tempfile.mkdtemp(dir=self._folder.name))
+        thumbnails.ask_for(folder, new)
+        command, environment = library_command(READING_MODULE, str(folder))
+
+        def done(_code: int, _output: str) -> None:
+            self._child = None
+            made = thumbnails.answer(folder)
+            for name, image, _labels in new:
+                version, told = found[name][0], made.get(name)
+                if told is None:  # without OpenCV: the pictures alone
+                    known.texture_digests[version], self._pictures[version] = "", str(image)
+                elif "problem" in told:
+                    known.texture_problems[version] = told["problem"]
+                else:
+                    known.texture_digests[version], self._pictures[version] = told["sha256"], told["thumbnail"]
+            self._show(found)
+
+        self._child = Child(command, done, environment)
+
+    def _stop_reading(self) -> None:
+        if self._child is not None:
+            self._child.stop()
+            self._child = None
+
+    def _show(self, found: dict) -> None:
+        known = self.session
         self.ui.texturesList.clear()
         for name, (version, *_rest) in found.items():
             item = qt.QListWidgetItem(name)
@@ -98,21 +128,6 @@ class TexturesSection(Section):
             item.setData(qt.Qt.UserRole, name)
             self.ui.texturesList.addItem(item)
         self.panel.refresh_soon()
-
-    def _read(self, name: str, version: tuple, image_path: Path, labels_path: Path | None) -> None:
-        try:
-            texture = read_texture(name, image_path, labels_path)
-        except InputError as error:
-            self.session.texture_problems[version] = str(error)
-            return
-        except ImportError:  # without OpenCV: the pictures alone
-            self.session.texture_digests[version] = ""
-            self._pictures[version] = str(image_path)
-            return
-        self.session.texture_digests[version] = texture.sha256
-        path = Path(self._folder.name) / f"{texture.sha256}.png"
-        files.write_png(path, thumbnail(texture.image, texture.labels, THUMBNAIL_PX))
-        self._pictures[version] = str(path)
 
     def on_path(self, _path=None) -> None:
         path = self.ui.texturesPathEdit.currentPath
@@ -184,23 +199,6 @@ class TexturesSection(Section):
                 if path is not None:
                     path.unlink(missing_ok=True)
         self.panel.refresh_soon()
-
-
-def thumbnail(image_rgb: np.ndarray, labels: np.ndarray, side_px: int) -> np.ndarray:
-    """uint8 (side, side, 3): the middle of the picture with the vessels' outlines drawn over it."""
-    import cv2
-
-    side = min(image_rgb.shape[:2])
-    top, left = ((length - side) // 2 for length in image_rgb.shape[:2])
-    image = cv2.resize(
-        image_rgb[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_AREA
-    )
-    shown = cv2.resize(
-        labels[top : top + side, left : left + side], (side_px, side_px), interpolation=cv2.INTER_NEAREST
-    )
-    vessels = (shown == VESSELS).astype(np.uint8)
-    image[(vessels == 1) & (cv2.erode(vessels, np.ones((3, 3), np.uint8)) == 0)] = OVERLAY_RGB
-    return image
 
 
 def smaller(image_rgb: np.ndarray, side_px: int) -> np.ndarray:

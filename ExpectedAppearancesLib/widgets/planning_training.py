@@ -14,7 +14,7 @@ from ..mrml import charts
 from ..runs.state import RunStatus
 from .planning_devices import find_gpus
 from .planning_qt import allow, quiet
-from .planning_run import RunControls, started
+from .planning_run import RunControls, in_the_way, started
 from .planning_section import Section, changed
 
 
@@ -59,9 +59,7 @@ class TrainingSection(Section):
         before = self.panel.steps["appearances"]
         if before.state is not StepState.DONE:
             problem = problem or before.text
-        problem = problem or self.panel.help.reason("training")
-        if self.panel.runs["synthesize"].active:
-            problem = _("Expected appearances are being made; wait until they are ready.")
+        problem = in_the_way(self.panel, "train") or problem or self.panel.help.reason("training")
         self.controls.refresh(problem, unfinished=self._unfinished(), said=self.step.text)
         curve = self._curve(self.session.case(p))
         allow(
@@ -85,8 +83,8 @@ class TrainingSection(Section):
 
     def on_start(self) -> None:
         self._live = []
-        if started(self.panel, self.controls.watch, *self.arguments()):
-            self.on_show_loss()
+        self.on_show_loss()  # before: to open a plot view takes Slicer a while
+        started(self.panel, self.controls.watch, *self.arguments())
 
     def arguments(self) -> tuple[list[str], dict[str, str]]:
         """Options of the command `train`, and what its environment needs."""

@@ -1,4 +1,4 @@
-"""Section Validation: the figures of merit as a table and a plot, and a verdict against the user's limits."""
+"""Section Validation: a study in a process of its own, its figures as table and plot, a verdict against limits."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ import html
 import slicer
 from slicer.i18n import tr as _
 
+from ..case.steps import StepState
 from ..evaluation.verdict import PROTOCOL_NAMES
+from ..gpus import device_arguments
 from ..mrml import charts
+from .labels import set_text
 from .planning_qt import allow
+from .planning_run import RunControls, in_the_way, started
 from .planning_section import Section
 
+STUDY_TEXTS = {"start": "Start the study", "continue": "Continue the study", "again": "Make the study again"}
+LEAST_TEXTURES = 2
 READY_COLOUR, NOT_READY_COLOUR = "#3c9a4e", "#c2452d"
 
 
@@ -20,15 +26,34 @@ class ValidationSection(Section):
     title = "Validation"
 
     def setup(self) -> None:
-        self.ui.showFiguresButton.connect("clicked(bool)", lambda _checked=False: self.on_show())
+        ui = self.ui
+        self._shown: list | None = None  # rows of the table as it is in the scene
+        self.controls = RunControls(
+            self.panel.runs["study"],
+            ui.studyStart,
+            ui.studyCancel,
+            ui.studyProgress,
+            ui.studyLine,
+            _("Train a model without each texture, and test it on views of that texture. The case's model stays."),
+            STUDY_TEXTS,
+        )
+        ui.studyStart.connect("clicked(bool)", lambda _checked=False: self.on_start())
+        ui.studyCancel.connect("clicked(bool)", lambda _checked=False: self.controls.watch.cancel())
+        ui.showFiguresButton.connect("clicked(bool)", lambda _checked=False: self.on_show())
 
     def refresh(self) -> None:
         rows = self._rows()
+        recorded = self.panel.recorded
+        textures = {item["style"] for item in recorded.index["items"]} if recorded.index else set()
+        self.controls.refresh(self._problem(len(textures)), recorded.study_stopped, said=self.step.text)
+        self._show_hint(len(textures))
         allow(
             self.ui.showFiguresButton,
             "" if rows else _("Train the model first: there are no figures yet."),
             _("Show the table of figures, and the plot of the mean ADD of each texture."),
         )
+        if rows and rows != self._shown and charts.table_of(self.panel.scene):
+            self._fill(rows)  # it was shown before, and there are newer figures
         self.ui.verdictLabel.visible = bool(rows)
         if rows:
             self.ui.verdictLabel.text = self._verdict(rows)
@@ -37,13 +62,50 @@ class ValidationSection(Section):
         rows = self._rows()
         if not rows:
             return
-        table, chart = charts.show_figures(self.panel.scene, rows, self.parameters.addLimitMm)
+        table, chart = self._fill(rows)
         if slicer.app.layoutManager():
             slicer.app.layoutManager().setLayout(slicer.vtkMRMLLayoutNode.SlicerLayoutFourUpPlotTableView)
         slicer.modules.plots.logic().ShowChartInLayout(chart)
         selection = slicer.app.applicationLogic().GetSelectionNode()
         selection.SetActiveTableID(table.GetID())
         slicer.app.applicationLogic().PropagateTableSelection()
+
+    def close(self) -> None:
+        self._shown = None
+
+    def on_start(self) -> None:
+        started(self.panel, self.controls.watch, *self.arguments())
+
+    def arguments(self) -> tuple[list[str], dict[str, str]]:
+        """Options of the command `study`, and what its environment needs: models like the one that is trained."""
+        p = self.parameters
+        device, environment = device_arguments(p.device)
+        options = ["--protocols", p.studyProtocols.value, "--preset", p.preset.value, "--minutes", f"{p.minutes:g}"]
+        return [*options, "--appearances", p.method.value, *device], environment
+
+    def _problem(self, textures: int) -> str:
+        """Why no study can begin, '' if nothing is in the way."""
+        before = self.panel.steps["appearances"]
+        problem = in_the_way(self.panel, "study")
+        if not problem and before.state is not StepState.DONE:
+            problem = before.text
+        if not problem and textures < LEAST_TEXTURES:
+            problem = _("A study leaves one texture out: make expected appearances of at least 2 textures.")
+        return problem or self.panel.help.reason("training")
+
+    def _show_hint(self, textures: int) -> None:
+        """How much work it is."""
+        p = self.parameters
+        models = textures * len(p.studyProtocols.value.split(","))
+        text = _("Trains {models} models as set above, {minutes:g} min each at most: {hours:.1f} hours.").format(
+            models=models, minutes=p.minutes, hours=models * p.minutes / 60
+        )
+        set_text(self.ui.studyHint, text if models else "")
+
+    def _fill(self, rows: list) -> tuple:
+        """Table and chart in the scene, with these figures."""
+        self._shown = rows
+        return charts.show_figures(self.panel.scene, rows, self.parameters.addLimitMm)
 
     def _rows(self) -> list:
         case = self.session.case(self.parameters)

@@ -1,7 +1,7 @@
 """The engine beside the paper's recipe in plain PyTorch, on the same label map and texture, in one run.
 
 Both end in 8-bit images, whose class-wise Gram distance is measured by the same fp32 code. The engine runs as it does
-by default (32 iterations; at 256 px 8 of them at half size), the reference 50 at full size, as the paper does.
+by default (30 iterations), the reference 50, as the paper does.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ import psutil
 import torch
 from safetensors.torch import load_file
 
+from ExpectedAppearancesLib.appearances.gram import CLASSES
 from ExpectedAppearancesLib.appearances.images import resized
 from ExpectedAppearancesLib.appearances.measure import GramMeasure
-from ExpectedAppearancesLib.appearances.synthesis import CLASSES, Job, Synthesizer
+from ExpectedAppearancesLib.appearances.synthesis import Job, Synthesizer
 from ExpectedAppearancesLib.appearances.vgg import SHIPPED_WEIGHTS, load_vgg
 from ExpectedAppearancesLib.appearances.workload import DEFAULT_ITERATIONS, images_at_once, operations_per_image
 from ExpectedAppearancesLib.case.case import Case
@@ -71,7 +72,7 @@ def _side_by_side(
             break
         texture = textures[turn % len(textures)]
         image, texture_labels = resized(texture, *labels.shape)
-        synthesizer._target(texture, *labels.shape)  # once for a texture, however many images: not an image's cost
+        synthesizer.targets.of(texture, *labels.shape)  # once for a texture, however many images: not an image's cost
         before = _matmul_rate(synthesizer)
         with _peak_memory(peaks, "own"):
             begin = time.perf_counter()

@@ -1,0 +1,74 @@
+"""Test frames of a study that is given none: views of the case's own appearances, at poses that are known."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from .. import files
+from ..appearances.store import folder_of, read_appearances
+from ..case.case import Case
+from ..errors import InputError
+from ..model.encoding import network_camera
+from ..model.views import ViewSettings, ViewSource
+from ..registration.poses_file import write_poses
+
+FRAMES_PER_TEXTURE = 24
+FRAME_PX = 256  # twice what the networks read
+SEED_OFFSET = 9001  # training, inner split and calibration draw their poses from other seeds
+
+
+def drawn_frames(
+    case: Case,
+    method: str | None,
+    per_texture: int = FRAMES_PER_TEXTURE,
+    seed: int = 0,
+    progress: Callable[[float, str], None] = lambda _fraction, _message: None,
+) -> Path:
+    """Path of CASE/study/frames/poses.json, with `per_texture` frames of each texture, which is their 'style'.
+
+    Drawn as training views are, with the microscope's blur, light and noise, but without negatives and deformation.
+    With method `surface` all textures are seen from the same fresh poses, with `image` from the poses of their
+    appearances. Drawn again only when what they show has changed.
+    Raises InputError when no appearances are complete.
+    """
+    method, appearances = read_appearances(case, method)
+    folder = case.folder / "study" / "frames"
+    render = case.manifest["stages"].get("render", {})
+    made_of = {
+        "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
+        "method": method,
+        "per_texture": per_texture,
+        "seed": seed,
+        "poses": {key: render.get(key) for key in ("ranges", "craniotomy")},
+    }
+    path, record = folder / "poses.json", folder / "made_of.json"
+    if path.is_file() and _known(record) == made_of:
+        return path
+    shutil.rmtree(folder, ignore_errors=True)
+    textures = sorted({appearance.style for appearance in appearances})
+    files.require_space(case.folder, len(textures) * per_texture * 0.15 + 5)
+    entries = []
+    for t, texture in enumerate(textures):
+        source = ViewSource(
+            case.folder, ViewSettings(method, FRAME_PX, (texture,), False, 0.0, 0.0, seed + SEED_OFFSET)
+        )
+        try:
+            for i in range(per_texture):
+                progress((t + i / per_texture) / len(textures), f"drawing test frames of {texture}")
+                view, image = source.view(i), folder / texture / f"{i:03d}.png"
+                files.write_png(image, view.image)
+                entries.append({"image": image, "camera_from_world": view.camera_from_world, "style": texture})
+        finally:
+            source.close()
+    write_poses(path, network_camera(case.camera, FRAME_PX), entries)
+    files.write_json(record, made_of)
+    return path
+
+
+def _known(record: Path) -> dict | None:
+    try:
+        return files.read_json(record, "record of the test frames")
+    except InputError:
+        return None

@@ -1,0 +1,58 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+import cases
+import pytest
+
+
+@pytest.fixture(scope="session")
+def phantom(tmp_path_factory):
+    from ExpectedAppearancesLib.demo.phantom import make_phantom
+
+    return make_phantom(tmp_path_factory.mktemp("phantom") / "case")
+
+
+@pytest.fixture(scope="session")
+def model(phantom):
+    from ExpectedAppearancesLib.live.estimator import open_model
+
+    return open_model(phantom.case)
+
+
+@pytest.fixture(scope="session")
+def frames(phantom):
+    """Twelve poses and their frames; from one to the next the camera moves by centimetres."""
+    from live_cases import SMALL
+
+    from ExpectedAppearancesLib.demo.phantom import PhantomPainter
+
+    poses = [phantom.pose(i / 12) for i in range(12)]
+    with PhantomPainter(phantom, SMALL) as painter:
+        return poses, [painter.paint(pose) for pose in poses]
+
+
+@pytest.fixture
+def scene():
+    """Slicer's real scene, with the logics that colours and segmentations need."""
+    pytest.importorskip("slicer")
+    from planning_scene import new_scene
+
+    return new_scene()
+
+
+@pytest.fixture
+def planned(scene, tmp_path):
+    """Session and parameters with models chosen, under a transform; and the folder of their files."""
+    from planning_scene import add_model, add_transform, parameters, turned
+
+    from ExpectedAppearancesLib.mrml.planning_session import PlanningSession
+
+    paths = cases.write_inputs(tmp_path)
+    parent = add_transform(scene, turned())
+    nodes = [add_model(scene, cases.vessels()), add_model(scene, cases.dome(), "Cortex")]
+    for node in nodes:
+        node.SetAndObserveTransformNodeID(parent.GetID())
+    return PlanningSession(), parameters(
+        vesselsNode=nodes[0], cortexModel=nodes[1], calibrationPath=str(paths["camera.json"])
+    )

@@ -1,0 +1,98 @@
+"""Poses by hand in a scene: handles, sliders, landmarks, and true poses that are collected."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.registration.poses_file import read_poses
+
+slicer = pytest.importorskip("slicer")
+
+from live_cases import add_of, camera_to_ras_of, choice_of, node_with, send, wait_for  # noqa: E402
+from mrml_views import new_application  # noqa: E402
+
+from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
+
+
+@pytest.fixture
+def application():
+    return new_application()
+
+
+def test_alignment_by_handles_sliders_and_landmarks_gives_the_true_pose(application, phantom, model, frames):
+    scene, _logic = application
+    true = frames[0][2]
+    node_with(scene, frames[1][2])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    before = scene.GetNumberOfNodes()
+    alignment = controller.begin_alignment()
+    start = alignment.camera_from_world
+    # Sliders: 5 mm to the right moves the vessels 5 mm along the camera's x.
+    controller.nudge(np.array([5.0, 0, 0]), np.zeros(3), start)
+    assert add_of(phantom, start, alignment.camera_from_world) == pytest.approx(5.0, abs=1e-6)
+    controller.tick()
+    difference = controller.difference()
+    assert difference.add_mm == pytest.approx(5.0, abs=1e-3)
+    assert controller.live.lines["truth"].GetDisplayNode().GetVisibility()
+    shift, turn = controller.nudges(start)
+    np.testing.assert_allclose(shift, [5, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(turn, 0, atol=1e-6)
+    # Handles: the user turns the transform in the scene; the vessels hang under it.
+    import vtk
+
+    turned = vtk.vtkTransform()
+    turned.Translate(3, -2, 1)
+    turned.RotateZ(4)
+    alignment.handles.SetMatrixTransformToParent(turned.GetMatrix())
+    moved = camera_to_ras_of(alignment.handles)
+    ras = np.diag([-1.0, -1.0, 1.0, 1.0])
+    np.testing.assert_allclose(alignment.camera_from_world, start @ ras @ moved @ ras, atol=1e-9)
+    # Landmarks picked where the true pose has them.
+    from ExpectedAppearancesLib.mrml.live_align import add_landmark_lists
+
+    in_frame, on_mesh = add_landmark_lists(controller.live)
+    vertices = phantom.case.vessels.vertices_mm[:: len(phantom.case.vessels.vertices_mm) // 6][:6]
+    in_camera = vertices @ true[:3, :3].T + true[:3, 3]
+    for point, seen in zip(vertices, in_camera):
+        on_mesh.AddControlPoint(*(point * [-1, -1, 1]))
+        index = in_frame.AddControlPoint(0, 0, 0)
+        in_frame.SetNthControlPointPosition(index, *(seen * controller.live.plane_mm / seen[2]))
+    assert controller.align_to_landmarks(in_frame, on_mesh) < 0.01
+    assert add_of(phantom, true, alignment.camera_from_world) < 0.01
+    controller.finish_alignment(keep=True)
+    assert add_of(phantom, true, controller.truth) < 0.01
+    assert controller.difference().add_mm < 0.3
+    for node in (in_frame, on_mesh):
+        scene.RemoveNode(node)
+    assert controller.live.models["Vessels"].GetParentTransformNode() is None
+    assert scene.GetNumberOfNodes() <= before + 2  # the landmark lists' display nodes
+    controller.close()
+
+
+def test_true_poses_are_collected_for_evaluation(application, phantom, model, frames, tmp_path):
+    scene, _logic = application
+    stream = node_with(scene, frames[1][2])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    with pytest.raises(InputError, match="align the vessels"):
+        controller.save_truth(tmp_path)
+    for i in (2, 3):
+        controller.begin_alignment().set_pose(frames[0][i])
+        controller.finish_alignment()
+        path = controller.save_truth(tmp_path)
+        controller.next_frame()
+        send(stream, frames[1][3])
+        wait_for(controller, lambda s: s.new)
+        assert controller.truth is None
+    _camera, saved = read_poses(path)
+    assert len(saved) == 2
+    for i, frame in zip((2, 3), saved):
+        np.testing.assert_allclose(frame.camera_from_world, frames[0][i], atol=1e-9)
+        np.testing.assert_array_equal(files.read_image_rgb(frame.image), frames[1][i])
+    controller.close()

@@ -1,0 +1,243 @@
+"""Where live frames come from: files, folders that are being filled, videos, devices, and their thread."""
+
+from __future__ import annotations
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.live import sources
+from ExpectedAppearancesLib.live.choice import Choice, SourceKind, open_source, problems_of
+from ExpectedAppearancesLib.live.feed import Feed, FeedState
+
+
+def noise(width=320, height=240, seed=0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(40, 255, (height, width, 3), dtype=np.uint8)
+
+
+def within(seconds, condition):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.002)
+    raise AssertionError("did not happen in time")
+
+
+def read_all(source, count, seconds=10.0):
+    found, end = [], time.monotonic() + seconds
+    while len(found) < count and time.monotonic() < end:
+        frame = source.read()
+        if frame is not None:
+            found.append(frame)
+        time.sleep(0.001)
+    return found
+
+
+def write_images(folder, names):
+    for i, name in enumerate(names):
+        files.write_png(folder / name, noise(seed=i))
+
+
+def test_folder_is_read_in_the_order_of_its_numbers(tmp_path):
+    write_images(tmp_path, ["f_10.png", "f_9.png", "f_1.png"])
+    source = sources.ImageFiles(tmp_path, rate_hz=1000)
+    source.open()
+    assert [frame.name for frame in read_all(source, 3)] == ["f_1.png", "f_9.png", "f_10.png"]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp"])
+def test_a_file_is_taken_only_when_it_is_whole(tmp_path, suffix):
+    image = noise()
+    data = cv2.imencode(suffix, image[..., ::-1])[1].tobytes()
+    now = [0.0]
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, clock=lambda: now[0])
+    source.open()
+    path = tmp_path / f"a{suffix}"
+    for share in (0.3, 0.6, 0.9):
+        path.write_bytes(data[: int(len(data) * share)])
+        now[0] += 0.1
+        assert source.read() is None
+    path.write_bytes(data)
+    now[0] += 0.1
+    found = source.read()
+    if found is None:  # a format without a mark at its end has to stand still for a moment
+        now[0] += 0.3
+        found = source.read()
+    assert found.image_rgb.shape == image.shape
+    if suffix != ".jpg":
+        np.testing.assert_array_equal(found.image_rgb, image)
+
+
+def test_a_file_that_never_gets_whole_is_said_and_left_out(tmp_path):
+    write_images(tmp_path, ["b.png"])
+    (tmp_path / "a.png").write_bytes((tmp_path / "b.png").read_bytes()[:200])
+    now = [0.0]
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, clock=lambda: now[0])
+    source.open()
+    assert source.read() is None
+    now[0] += 3
+    with pytest.raises(InputError, match=r"a\.png: damaged"):
+        source.read()
+    now[0] += 1
+    assert source.read().name == "b.png"
+
+
+def test_only_new_images_of_a_folder(tmp_path):
+    write_images(tmp_path, ["1.png"])
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, only_new=True)
+    source.open()
+    assert source.read() is None
+    write_images(tmp_path, ["2.png"])
+    assert read_all(source, 1)[0].name == "2.png"
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """Twenty frames at 50 per second, each of its own grey."""
+    path = tmp_path_factory.mktemp("video") / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 50.0, (64, 48))
+    for i in range(20):
+        writer.write(np.full((48, 64, 3), (10 * i, 0, 200), np.uint8))
+    writer.release()
+    return path
+
+
+def test_video_plays_at_its_speed_in_rgb_and_ends(video):
+    now = [0.0]
+    source = sources.VideoFile(video, clock=lambda: now[0])
+    source.open()
+    first = source.read()
+    assert source.read() is None  # not due yet
+    red, _green, blue = first.image_rgb[20, 20]
+    assert red > 180 and blue < 20
+    now[0] += 5 / 50
+    later = source.read()
+    assert later.number == 4 + source.dropped - 3  # late frames are left out and counted
+    assert abs(int(later.image_rgb[20, 20, 2]) - 10 * later.number) < 8
+    assert source.dropped >= 3
+    now[0] += 10
+    with pytest.raises(sources.SourceEnded):
+        for _ in range(30):
+            now[0] += 0.02
+            source.read()
+    source.close()
+
+
+def test_video_begins_again(video):
+    now = [0.0]
+    source = sources.VideoFile(video, repeat=True, clock=lambda: now[0])
+    source.open()
+    seen = 0
+    for _ in range(60):
+        now[0] += 0.02
+        seen += source.read() is not None
+    assert seen > 40
+    source.close()
+
+
+def test_files_that_are_no_video_are_said(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="not a video"):
+        sources.VideoFile(tmp_path / "a.mp4").open()
+    with pytest.raises(sources.SourceLost, match="not found"):
+        sources.VideoFile(tmp_path / "b.mp4").open()
+
+
+class FakeCapture:
+    """A capture device that can be unplugged."""
+
+    plugged = True
+
+    def __init__(self, _device):
+        pass
+
+    def isOpened(self):
+        return type(self).plugged
+
+    def set(self, *_):
+        return True
+
+    def read(self):
+        time.sleep(0.002)
+        return (True, noise()) if type(self).plugged else (False, None)
+
+    def release(self):
+        pass
+
+
+def test_feed_says_that_the_device_is_lost_and_returns_with_it(monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+    monkeypatch.setattr(FakeCapture, "plugged", True)
+    frames = []
+    feed = Feed(sources.CaptureDevice(0), frames.append, retry_s=0.02)
+    feed.start()
+    within(5, lambda: len(frames) > 3)
+    assert feed.status.state is FeedState.RUNNING
+    FakeCapture.plugged = False
+    within(5, lambda: feed.status.state is FeedState.LOST)
+    assert "capture device 0" in feed.status.problem
+    before = len(frames)
+    FakeCapture.plugged = True
+    within(5, lambda: len(frames) > before + 3)
+    assert feed.status.state is FeedState.RUNNING and not feed.status.problem
+    assert feed.stop()
+    after = len(frames)
+    time.sleep(0.05)
+    assert len(frames) == after
+
+
+def test_feed_ends_after_the_last_file_and_survives_a_driver_that_fails(tmp_path):
+    write_images(tmp_path, ["1.png", "2.png"])
+    frames = []
+    feed = Feed(sources.ImageFiles([tmp_path / "1.png", tmp_path / "2.png"], rate_hz=500), frames.append)
+    feed.start()
+    within(5, lambda: feed.status.state is FeedState.ENDED)
+    assert [frame.name for frame in frames] == ["1.png", "2.png"]
+
+    class Broken(sources.ImageFiles):
+        def read(self):
+            raise RuntimeError("driver")
+
+    feed = Feed(Broken([tmp_path / "1.png"]), frames.append)
+    feed.start()
+    within(5, lambda: feed.status.state is FeedState.LOST)
+    assert "driver" in feed.status.problem
+    assert feed.stop()
+
+
+def test_a_folder_that_vanishes_is_said_and_found_again(tmp_path):
+    folder = tmp_path / "share"
+    folder.mkdir()
+    write_images(folder, ["1.png"])
+    frames = []
+    feed = Feed(sources.ImageFiles(folder, rate_hz=500), frames.append, retry_s=0.02)
+    feed.start()
+    within(5, lambda: frames)
+    (folder / "1.png").unlink()
+    folder.rmdir()
+    within(5, lambda: feed.status.state is FeedState.LOST)
+    folder.mkdir()
+    write_images(folder, ["2.png"])
+    within(5, lambda: len(frames) == 2)
+    assert feed.stop()
+
+
+def test_choice_lists_all_that_is_missing_and_opens_what_is_there(tmp_path, video):
+    found = problems_of(Choice(path=str(tmp_path / "none"), camera_path=str(tmp_path / "c.json")))
+    assert len(found) == 3 and "case" in found[0] and "none" in found[1] and "c.json" in found[2]
+    (tmp_path / "a.txt").write_text("x")
+    assert "not a kind of file" in problems_of(Choice(path=str(tmp_path / "a.txt")))[-1]
+    assert "number of the capture device" in problems_of(Choice(kind=SourceKind.DEVICE, device=" "))[-1]
+    assert "Choose the volume" in problems_of(Choice(kind=SourceKind.NODE))[-1]
+    assert isinstance(open_source(Choice(path=str(tmp_path))).source, sources.ImageFiles)
+    assert isinstance(open_source(Choice(path=str(video))).source, sources.VideoFile)
+    write_images(tmp_path, ["1.png"])
+    assert open_source(Choice(path=str(tmp_path / "1.png"))).still
+    with pytest.raises(InputError, match=r"a\.txt"):
+        open_source(Choice(path=str(tmp_path / "a.txt")))

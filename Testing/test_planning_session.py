@@ -1,0 +1,286 @@
+"""What the planning panel works on, on slicer-core's scene: cases saved and opened again, steps, options."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from dataclasses import replace
+
+import cases
+import numpy as np
+import pytest
+
+from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.appearances import store
+from ExpectedAppearancesLib.appearances.overview import overview_view
+from ExpectedAppearancesLib.case import recorded
+from ExpectedAppearancesLib.case.steps import StepState
+from ExpectedAppearancesLib.geometry.camera import read_camera
+
+slicer = pytest.importorskip("slicer")
+import vtk  # noqa: E402 (after the skip)
+from planning_scene import LPS, Source, Where, parameters, save, turned  # noqa: E402
+from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
+
+from ExpectedAppearancesLib.mrml import mri, planning, planning_session  # noqa: E402
+from ExpectedAppearancesLib.mrml.planning_adopt import adopt  # noqa: E402
+
+
+def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
+    session, p = planned
+    assert session.steps(p)["case"].state is StepState.MISSING
+    p.casePath = str(tmp_path / "case")
+    assert session.steps(p)["case"].state is StepState.READY
+    case = save(session, p, tmp_path)
+    steps = session.steps(p)
+    assert (steps["case"].state, steps["microscope"].state) == (StepState.DONE, StepState.DONE)
+    expected_ras = cases.vessels().vertices_mm @ turned()[:3, :3].T + turned()[:3, 3]
+    np.testing.assert_allclose(case.vessels.vertices_mm * LPS, expected_ras, atol=1e-4)
+
+    p.vesselsNode.SetAndObserveTransformNodeID(None)
+    assert session.changed_models(p) == ("vessel model",)
+    assert session.steps(p)["case"].state is StepState.STALE
+
+    count = scene.GetNumberOfNodesByClass("vtkMRMLModelNode")
+    for _repeat in range(2):
+        assert adopt(session, p, scene) is not None
+        assert session.steps(p)["case"].state is StepState.DONE
+        assert scene.GetNumberOfNodesByClass("vtkMRMLModelNode") == count + 2
+
+
+def test_rendered_poses_are_those_that_were_planned(planned, tmp_path):
+    """The options for `render`, parsed and run by it, leave nothing outdated; another tilt does."""
+    from ExpectedAppearancesLib import cli
+
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    p.lateralAuto, p.lateralMm = False, 0.0
+    case = save(session, p, tmp_path)
+    assert cli.main(["render", str(case.folder), *session.render_arguments(p)]) == 0
+    assert session.steps(p)["poses"].state is StepState.DONE
+    p.tiltMaxDeg = 30.0
+    assert "the tilt" in session.steps(p)["poses"].text
+    # Opening the case takes over what it was rendered with.
+    other = parameters(casePath=p.casePath, poseCount=99)
+    scene = p.vesselsNode.GetScene()
+    adopt(session, other, scene)
+    assert (other.poseCount, other.tiltMaxDeg, other.lateralAuto, other.lateralMm) == (4, 50.0, False, 0.0)
+    assert other.craniotomySource is Where.FITTED
+    assert session.steps(other)["poses"].state is StepState.DONE
+
+
+def test_a_craniotomy_that_was_marked_is_kept_when_the_case_is_opened(scene, planned, tmp_path):
+    from ExpectedAppearancesLib import cli
+
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    case = save(session, p, tmp_path)
+    point = scene.AddNewNodeByClass("vtkMRMLMarkupsFiducialNode", "Craniotomy")
+    p.craniotomySource, p.craniotomyNode = Where.MARKED, point
+    assert "click on the cortex" in session.steps(p)["poses"].text
+    centre = case.vessels.centroid_mm + np.array([2.0, 0.0, 0.0])
+    point.AddControlPoint(*(centre * LPS))
+    first = session.sampler(p)
+    assert cli.main(["render", str(case.folder), *session.render_arguments(p)]) == 0
+    assert session.steps(p)["poses"].state is StepState.DONE
+    centre[0] += 1.0
+    point.SetNthControlPointPosition(0, *(centre * LPS))
+    assert session.sampler(p) is not first
+    assert "craniotomy" in session.steps(p)["poses"].text
+    other = parameters(casePath=p.casePath)
+    adopt(session, other, scene)
+    assert other.craniotomySource is Where.RECORDED
+    assert session.steps(other)["poses"].state is StepState.DONE
+
+
+def test_all_problems_of_a_case_are_told_at_once(planned, tmp_path):
+    session, p = planned
+    p.calibrationPath = str(tmp_path / "absent.json")
+    p.vesselsNode.SetAndObservePolyData(vtk.vtkPolyData())
+    found = "\n".join(session.problems_of_new_case(p, ""))
+    for words in ("choose one with New", "holds no surface", "absent.json"):
+        assert words in found
+    assert session.steps(p)["poses"].state is StepState.MISSING
+
+
+def test_textures_are_compared_with_what_was_synthesised(planned, tmp_path):
+    from ExpectedAppearancesLib.textures.library import read_texture, shipped_textures_folder
+
+    session, p = planned
+    files = session.texture_files(p)
+    assert len(files) == 10
+    assert set(session.chosen(p).textures.values()) == {""}  # not read yet
+    name, (version, image, labels) = next(iter(files.items()))
+    texture = read_texture(name, image, labels)
+    assert texture.sha256 != replace(texture, labels=np.maximum(texture.labels, 1)[::-1]).sha256
+    session.texture_digests[version] = texture.sha256
+    assert session.chosen(p).textures[name] == texture.sha256
+    p.texturesPath = str(tmp_path / "gone")
+    assert "no longer there" in session.steps(p)["textures"].text
+    assert session.textures_folder(parameters()) == shipped_textures_folder()
+
+
+def test_microscope_from_its_field_of_view(planned):
+    session, p = planned
+    p.cameraSource = Source.VIEW
+    camera = session.camera(p)
+    assert camera.width / camera.fx * 300.0 == pytest.approx(40.0)
+    assert read_camera(p.calibrationPath) == session.camera(parameters(calibrationPath=p.calibrationPath))
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How often each thing that costs was done since the last look."""
+    done = Counter()
+
+    def count(module, name):
+        usual = getattr(module, name)
+
+        def noted(*arguments, **named):
+            done[name] += 1
+            return usual(*arguments, **named)
+
+        noted.__name__ = name
+        monkeypatch.setattr(module, name, noted)
+
+    for module, name in (
+        (files, "sha256"),
+        (files, "read_json"),
+        (recorded, "overview_changed"),
+        (recorded, "training_state"),
+        (recorded, "newest_image"),
+        (planning, "world_mesh"),
+        (planning, "same_mesh"),
+        (planning_session, "find_craniotomy"),
+        (planning_session, "PoseSampler"),
+        (mri, "scan_identity"),
+    ):
+        count(module, name)
+
+    def look() -> dict:
+        found = dict(done)
+        done.clear()
+        return found
+
+    return look
+
+
+def test_a_refresh_does_only_what_has_changed(scene, planned, tmp_path, counted):
+    """Ticks of the panel's timer must stay cheap however large the case is, so work is counted, not timed."""
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    case = save(session, p, tmp_path)
+    case.record("render", **session.pose_settings(p), circular_field=None, done=True)
+    camera, pose = overview_view(session.craniotomy(p), case.cortex, 64)
+    item = {"style": "a", "image": "a.png", "texture_sha256": "", "camera_from_world": pose.tolist()}
+    settings = {"size_px": 384, "iterations": 50, "overview": pose.tolist()}
+    store.write_index(case, "surface", camera, settings, [item] * 500, done=True)
+    (case.model_folder).mkdir()
+    (case.model_folder / "checkpoint.safetensors").write_bytes(b"")
+
+    def tick():
+        record = session.recorded(p)
+        session.steps(p, frozenset({"train"}), record)
+        session.reader.curve(session.case(p))
+        session.reader.newest_image(session.case(p), "surface")
+        return counted()
+
+    assert tick()["overview_changed"] == 1
+    assert [tick() for _ in range(5)] == [{}] * 5
+    case.record("train", done=False)
+    counted()  # what writing reads
+    assert tick() == {"read_json": 2}  # the manifest and the camera; nothing is hashed again
+    (case.model_folder / "checkpoint.safetensors").write_bytes(b"12345678")
+    assert tick() == {"training_state": 1}
+    (case.appearances_folder / "surface" / "b.png").touch()
+    assert tick() == {"newest_image": 1}
+    p.tiltMaxDeg = 40.0
+    assert tick() == {"PoseSampler": 1}
+    p.vesselsNode.SetAndObserveTransformNodeID(None)
+    moved = tick()
+    assert moved == {"world_mesh": 1, "same_mesh": 1, "find_craniotomy": 1, "PoseSampler": 1}
+    store.write_index(case, "surface", camera, settings, [item] * 501, done=True)
+    assert tick() == {"read_json": 1, "sha256": 1, "overview_changed": 1, "newest_image": 1}
+
+
+def test_prepared_in_pieces_it_answers_at_once(scene, planned, tmp_path, counted):
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    save(session, p, tmp_path)
+    p.vesselsNode.GetPolyData().Modified()
+    counted()
+    done = []
+    for _piece in session.prepare(p):
+        done.append(counted())
+    assert max(len(piece) for piece in done) <= 2 and sum(piece.get("world_mesh", 0) for piece in done) == 1
+    session.steps(p)
+    assert counted() == {}
+    p.vesselsNode.SetAndObservePolyData(vtk.vtkPolyData())
+    list(session.prepare(p))  # what is wrong is said by the steps
+    assert session.steps(p)["poses"].state is StepState.MISSING
+
+
+def test_a_segment_that_is_drawn_on_waits_for_the_end_of_a_run(scene, planned, counted):
+    session, p = planned
+    image = slicer.vtkOrientedImageData()
+    image.SetDimensions(12, 12, 12)
+    image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
+    voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(12, 12, 12)
+    voxels[:] = 0
+    voxels[3:8, 3:8, 3:8] = 1
+    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "S")
+    node.CreateDefaultDisplayNodes()
+    p.vesselsSegmentId = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
+    p.vesselsNode = node
+    session.busy = True
+    before = session.mesh(p, "vessels")
+    assert counted() == {"world_mesh": 1}  # newly chosen: it is looked at all the same
+    segment = node.GetSegmentation().GetSegment(p.vesselsSegmentId)
+    segment.GetRepresentation(node.GetSegmentation().GetSourceRepresentationName()).Modified()
+    assert session.mesh(p, "vessels") is before and counted() == {}
+    session.busy = False
+    session.mesh(p, "vessels")
+    assert counted() == {"world_mesh": 1}
+
+
+def test_the_session_loads_nothing_heavy():
+    """In a fresh interpreter: what the panel imports when it is opened."""
+    import subprocess
+
+    code = (
+        "import sys; from ExpectedAppearancesLib.mrml import planning_session, planning_adopt, labelling, charts; "
+        "from ExpectedAppearancesLib.runs import runner, closing, dependencies; "
+        "from ExpectedAppearancesLib.model.presets import PRESETS; from ExpectedAppearancesLib.masks import stage; "
+        "session = planning_session.PlanningSession(); "
+        "print([m for m in ('torch', 'cv2', 'onnxruntime', 'skimage', 'scipy', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+LOOK_AROUND = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import cases, numpy as np
+from ExpectedAppearancesLib.masks.renderer import MaskRenderer
+from ExpectedAppearancesLib.mrml import planning
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
+from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
+vessels, cortex, camera = cases.vessels(), cases.dome(), cases.camera()
+sampler = PoseSampler(find_craniotomy(vessels, cortex), PoseRanges(), camera, vessels.vertices_mm, 0)
+poses = np.stack([sampler.sample(i) for i in range(3)])
+planning.frustum_polydata(camera, poses, np.ones(3), "LPS")
+with MaskRenderer(vessels, cortex, camera) as renderer:
+    assert renderer.render(poses[0]).any()
+print([m for m in ("torch", "cv2", "onnxruntime", "skimage", "scipy") if m in sys.modules])
+"""
+
+
+def test_drawing_cameras_and_label_maps_loads_nothing_heavy():
+    """OpenCV takes a quarter of a second of the GUI's thread, seconds on a busy computer."""
+    import subprocess
+    from pathlib import Path
+
+    command = [sys.executable, "-c", LOOK_AROUND, str(Path(__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
