@@ -11,8 +11,8 @@ import tempfile
 import time
 from pathlib import Path
 
-# Modules of this folder with measure(inputs_folder) -> dict of keys of benchmark.json. Each runs in a process of its own:
-# VTK and torch's threads do not meet, and memory is its own.
+# Modules of this folder with measure(inputs_folder) -> dict of keys of benchmark.json. Each runs in a process of its
+# own: VTK and torch's threads do not meet, and memory is its own.
 STAGES = ("masks", "synthesis", "synthesis_scaling", "surface_views", "registration", "live_update")
 LIMIT_S = 900
 
