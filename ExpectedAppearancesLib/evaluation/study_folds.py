@@ -18,7 +18,7 @@ from ..runs.environment import library_environment, python_for_runs
 
 PROTOCOLS = ("strict", "loto")
 COMMAND = (python_for_runs(), "-m", "ExpectedAppearancesLib")
-PATIENCE_S = 30.0  # that a stopped training is given to save what it has
+PATIENCE_S = 20.0  # that a stopped training is given to save what it has; a run that is cancelled has 30
 _PROGRESS = re.compile(r"^\s*(\d+) %  (.*?)(?: \([^()]* left\))?$")  # the time left is the fold's, not the study's
 SPACE_MB = {"fold": 60.0, "under way": 400.0}  # of a finished fold, and of a training with its checkpoint
 
