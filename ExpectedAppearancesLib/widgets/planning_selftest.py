@@ -96,15 +96,13 @@ def test_microscope_from_file_or_view(test) -> None:
     p = panel.parameters
     test.assertEqual(panel.steps["microscope"].state, StepState.MISSING)
     p.cameraSource = type(p.cameraSource)("view")
-    let_events_pass(0.2)
-    test.assertEqual(panel.steps["microscope"].state, StepState.READY)
+    wait_until(test, lambda: panel.steps["microscope"].state is StepState.READY)
     test.assertIn("40", panel.ui.microscopeSummary.text)
     with Folder() as folder:
         (folder / "camera.json").write_text("{}", encoding="utf-8")
         p.cameraSource = type(p.cameraSource)("file")
         panel.ui.calibrationPathEdit.currentPath = str(folder / "camera.json")
-        let_events_pass(0.2)
-        test.assertEqual(panel.steps["microscope"].state, StepState.MISSING)
+        wait_until(test, lambda: panel.steps["microscope"].state is StepState.MISSING)
         test.assertIn("camera.json", panel.steps["microscope"].text)
 
 
