@@ -7,7 +7,7 @@ import torch
 from .vgg import CONVOLUTIONS, WIDTHS
 
 # Ends as near to the texture as the paper's 50 iterations from small noise (docs/benchmarks.md).
-DEFAULT_ITERATIONS = 30
+DEFAULT_ITERATIONS = 28
 PIXELS_AT_ONCE = 2**17  # through the network on a processor: larger tensors are given anew by the system every time
 SHARE_OF_FREE = 0.5  # others compute here too
 # Peak resident memory of one image of 256 px besides the history of L-BFGS (2 x 3 x 4 bytes a pixel and pair) was

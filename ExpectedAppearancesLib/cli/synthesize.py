@@ -38,7 +38,7 @@ def add_parser(subparsers) -> None:
     )
     parser.add_argument("--size", type=int, help="height of the images, px; left out: 384 (surface) or 256 (image)")
     parser.add_argument("--seeds", type=int, default=1, help="surface: appearances per texture")
-    parser.add_argument("--iterations", type=int, default=30, help="L-BFGS iterations")
+    parser.add_argument("--iterations", type=int, default=28, help="L-BFGS iterations")
     parser.add_argument("--batch", type=int, help="images optimised together; left out: as many as memory allows")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     parser.add_argument(

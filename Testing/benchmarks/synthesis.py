@@ -1,7 +1,7 @@
 """The engine beside the paper's recipe in plain PyTorch, on the same label map and texture, in one run.
 
 Both end in 8-bit images, whose class-wise Gram distance is measured by the same fp32 code. The engine runs as it does
-by default (30 iterations), the reference 50, as the paper does.
+by default (28 iterations), the reference 50, as the paper does.
 """
 
 from __future__ import annotations
