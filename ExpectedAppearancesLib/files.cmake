@@ -124,6 +124,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/registration/contrast.py
   ExpectedAppearancesLib/registration/covariance.py
   ExpectedAppearancesLib/registration/decoding.py
+  ExpectedAppearancesLib/registration/descent.py
   ExpectedAppearancesLib/registration/footage.py
   ExpectedAppearancesLib/registration/pnp.py
   ExpectedAppearancesLib/registration/poses_file.py

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.pose import geodesic_angle_rad, pose_from_rotation
-from ..registration.confidence import GOOD_ADD_MM
+from ..registration.confidence import GOOD_ADD_MM, calibration_error
 
 ADD_RANGE_MM = 20.0
 ACCURACY_LIMITS = (3, 5)  # n of the reported n mm-n deg
@@ -158,8 +158,7 @@ def reliability(confidence: np.ndarray, errors: FrameErrors, bins: int = 10) -> 
                     "add_below_3mm": float(good[own].mean()),
                 }
             )
-    gaps = [row["frames"] * abs(row["confidence"] - row["add_below_3mm"]) for row in rows]
-    return {"expected_calibration_error": sum(gaps) / max(1, len(confidence)), "bins": rows}
+    return {"expected_calibration_error": calibration_error(confidence, good, bins), "bins": rows}
 
 
 def mean_pose(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:

@@ -36,7 +36,14 @@ tr.total td { font-weight: 600; } img { max-width: 100%; height: auto; }
 .true { color: #17953a; font-weight: 600; } .predicted { color: #2f62e0; font-weight: 600; }
 """
 
-_TEMPLATE = """<!DOCTYPE html>
+# In both reports, of one evaluation and of a study.
+RELIABILITY_SECTION = """{% if reliability %}<h2>Confidence</h2>
+<p>Share of frames with ADD below 3 mm against the confidence they were given; below the diagonal confidence was too
+high. The expected calibration error is the mean distance from the diagonal.</p>
+<img src="{{ reliability }}" alt="Reliability diagram">{% endif %}"""
+
+_TEMPLATE = (
+    """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Registration of {{ case }}</title>
 <style>{{ style_sheet }}</style></head><body>
@@ -57,15 +64,15 @@ ADD below 0 to 20 mm. Frames without a pose have no ADD and count as misses in s
 refused frames that have a pose are in the figures of all frames, and left out of accepted only.</p>
 <h2>Accuracy against threshold</h2><img src="{{ curves }}" alt="Accuracy-threshold curves">
 {% if by_style %}<h2>Styles</h2><img src="{{ by_style }}" alt="Figures of each style">{% endif %}
-{% if reliability %}<h2>Confidence</h2>
-<p>Share of frames with ADD below 3 mm against the confidence they were given; below the diagonal confidence was too
-high. The expected calibration error is the mean distance from the diagonal.</p>
-<img src="{{ reliability }}" alt="Reliability diagram">{% endif %}
+"""
+    + RELIABILITY_SECTION
+    + """
 <h2>Overlays</h2>
 <p>Outline of the vessels at the <span class="true">true</span> and at the <span class="predicted">predicted</span>
 pose, from the smallest error to the largest.</p><img src="{{ overlays }}" alt="Overlays">
 </body></html>
 """
+)
 
 
 def write_report(folder: Path, case_name: str, evaluation) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .. import __version__, files
 from .curves import write_reliability
-from .report import COLUMNS, STYLE_SHEET, cells, embedded, embedded_photograph
+from .report import COLUMNS, RELIABILITY_SECTION, STYLE_SHEET, cells, embedded, embedded_photograph
 from .study_figures import write_study_curves, write_texture_bars, write_texture_counts
 
 PROTOCOL_NAMES = {
@@ -16,7 +16,8 @@ PROTOCOL_NAMES = {
     "loto": "paper's form (unseen texture, seen poses)",
 }
 
-_TEMPLATE = """<!DOCTYPE html>
+_TEMPLATE = (
+    """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Study of {{ cases }}</title><style>{{ style_sheet }}
 summary { cursor: pointer; } details { margin: .6em 0; } .left { text-align: left; }
@@ -49,10 +50,9 @@ ADD below 0 to 20 mm. Frames without a pose count as misses in shares and AUC. R
 these figures; rows "accepted only" leave them out.</p>{% endif %}
 {% if curves %}<h2>Accuracy against threshold</h2><img src="{{ curves }}" alt="Accuracy-threshold curves">{% endif %}
 {% if bars %}<h2>Each left-out texture</h2><img src="{{ bars }}" alt="Mean ADD on each left-out texture">{% endif %}
-{% if reliability %}<h2>Confidence</h2>
-<p>Share of frames with ADD below 3 mm against the confidence they were given; below the diagonal confidence was too
-high. The expected calibration error is the mean distance from the diagonal.</p>
-<img src="{{ reliability }}" alt="Reliability diagram">{% endif %}
+"""
+    + RELIABILITY_SECTION
+    + """
 {% for name, rows in per_style %}<details><summary>{{ name }}</summary>{{ figures(rows, "left-out texture") }}</details>
 {% endfor %}
 {% if counts %}<h2>Number of textures</h2>
@@ -77,6 +77,7 @@ pose, from the smallest error to the largest, on textures that the models have n
 {% endif %}
 </body></html>
 """
+)
 
 
 def write_study_report(folder: Path, studies: Sequence[tuple[Path, dict]]) -> None:

@@ -8,14 +8,14 @@ Numpy and OpenCV only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.pose import pose_from_rotation, rotation_matrix, rotation_vector
 from ..geometry.silhouette import Silhouette
+from .descent import Descent
 from .pnp import PoseFit, projection_jacobian
 
 SHARPER = 2  # frames are looked at in so many times the size that the network reads
@@ -78,13 +78,10 @@ class ContrastAligner:
         corners = np.ascontiguousarray((self._vertices_mm[corners] - centre).T)
         count = len(edges[::every])
         relative = (corners[:, :count] + corners[:, count : 2 * count]) / 2
-        first, origin = fit.camera_from_world[:3, :3], fit.camera_from_world[:3, :3] @ centre
-        origin = origin + fit.camera_from_world[:3, 3]
-        rotation, position = start[:3, :3], start[:3, :3] @ centre + start[:3, 3]
-        prior = np.linalg.inv(fit.covariance * PRIOR)
+        descent = Descent(fit, start, PRIOR)
         focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         for _ in range(ITERATIONS):
-            seen = rotation @ corners + position[:, None]
+            seen = descent.rotation @ corners + descent.position[:, None]
             pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
             a, b, within = (pixels[:, i * count : (i + 1) * count] for i in range(3))
             normals = _outward(a, b, within)
@@ -92,29 +89,22 @@ class ContrastAligner:
             if profile.on_tissue.sum() < LEAST_POINTS:
                 return None
             offsets_px, weight = profile.edges()
-            turned = rotation @ relative
-            jacobian = projection_jacobian(turned, turned + position[:, None], focal)
+            turned = descent.rotation @ relative
+            jacobian = projection_jacobian(turned, turned + descent.position[:, None], focal)
             gradient = normals[0] * jacobian[:, 0] + normals[1] * jacobian[:, 1]
-            weighted = gradient * (weight * INDEPENDENT / (SIGMA_PX**2 * profile.on_tissue.sum()))
-            information = weighted @ gradient.T + prior
-            gone = np.concatenate([rotation_vector(rotation @ first.T), position - origin])
-            step = np.linalg.solve(information, weighted @ offsets_px - prior @ gone)
-            rotation = rotation_matrix(step[:3]) @ rotation
-            position = position + step[3:]
-            if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-2:
+            count_as = INDEPENDENT / (SIGMA_PX**2 * profile.on_tissue.sum())
+            if descent.step(gradient, weight * count_as, offsets_px):
                 break
-        if not np.isfinite(position).all():
+        refined = descent.result()
+        if refined is None:
             return None
-        pose = pose_from_rotation(rotation, position - rotation @ centre)
-        turned_rad = np.linalg.norm(rotation_vector(rotation @ first.T))
-        moved_mm = np.hypot(np.linalg.norm(position - origin), turned_rad * self._radius_mm * np.sqrt(2 / 3))
         used = weight > 0
         return Contrast(
-            replace(fit, camera_from_world=pose, covariance=np.linalg.inv(information), residuals=1),
+            refined,
             float(weight.sum() / profile.on_tissue.sum()),
             float(np.abs(offsets_px[used]).mean()) if used.any() else REACH_PX,
             profile.separation,
-            float(moved_mm),
+            descent.moved_mm(self._radius_mm),
         )
 
 

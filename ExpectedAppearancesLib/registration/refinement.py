@@ -6,14 +6,14 @@ spot. Numpy and OpenCV only: nothing is rendered in the operating room.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.pose import pose_from_rotation, rotation_matrix, rotation_vector
 from ..geometry.silhouette import Silhouette
+from .descent import Descent
 from .pnp import PoseFit, projection_jacobian
 
 POINTS = 600  # of the outline, at most
@@ -55,13 +55,10 @@ class VesselAligner:
         edges = self._silhouette.edges(fit.camera_from_world, facing_borders_only=True)
         edges = edges[:: len(edges) // POINTS + 1]
         relative = np.ascontiguousarray((self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm).T)
-        rotation = first = fit.camera_from_world[:3, :3]
-        position = start = rotation @ fit.centre_world_mm + fit.camera_from_world[:3, 3]
-        prior = np.linalg.inv(fit.covariance * PRIOR)
-        information = prior
+        descent = Descent(fit, fit.camera_from_world, PRIOR)
         for _ in range(ITERATIONS):
-            turned = rotation @ relative
-            seen = turned + position[:, None]
+            turned = descent.rotation @ relative
+            seen = turned + descent.position[:, None]
             pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
             where = np.ascontiguousarray(((pixels + 0.5) * finer - 0.5).T, np.float32)[None]
             distance, along, down = cv2.split(
@@ -72,24 +69,15 @@ class VesselAligner:
             weight = (1 - np.minimum(np.abs(distance) / (REACH_PX * scale), 1) ** 2) ** 2 * inside
             jacobian = projection_jacobian(turned, seen, focal)
             gradient = along[0] * jacobian[:, 0] + down[0] * jacobian[:, 1]
-            weighted = gradient * (weight * INDEPENDENT / ((SIGMA_PX * scale) ** 2 * max(1, len(edges))))
-            information = weighted @ gradient.T + prior
-            gone = np.concatenate([rotation_vector(rotation @ first.T), position - start])
-            step = np.linalg.solve(information, -weighted @ distance - prior @ gone)
-            rotation = rotation_matrix(step[:3]) @ rotation
-            position = position + step[3:]
-            if np.abs(step[:3]).max() < 1e-4 and np.abs(step[3:]).max() < 1e-2:
+            count_as = INDEPENDENT / ((SIGMA_PX * scale) ** 2 * max(1, len(edges)))
+            if descent.step(gradient, weight * count_as, -distance):
                 break
         near = inside & (np.abs(distance) < REACH_PX * scale)
-        if not np.isfinite(position).all() or not near.any():
+        refined = descent.result()
+        if refined is None or not near.any():
             return Alignment(fit, 0.0, REACH_PX, 0.0)
-        pose = pose_from_rotation(rotation, position - rotation @ fit.centre_world_mm)
-        turned_rad = np.linalg.norm(rotation_vector(rotation @ first.T))
-        moved = np.hypot(np.linalg.norm(position - start), turned_rad * self._radius_mm * np.sqrt(2 / 3))
-        # Neighbours that err together are in INDEPENDENT and PRIOR already.
-        refined = replace(fit, camera_from_world=pose, covariance=np.linalg.inv(information), residuals=1)
-        residual = float(np.abs(distance[near]).mean() / scale)
-        return Alignment(refined, float(near.sum() / max(1, inside.sum())), residual, float(moved))
+        matched, residual = near.sum() / max(1, inside.sum()), np.abs(distance[near]).mean() / scale
+        return Alignment(refined, float(matched), float(residual), descent.moved_mm(self._radius_mm))
 
 
 def _signed_distance(vessel_logit, surface_logit, scale: float) -> tuple[np.ndarray, np.ndarray]:
