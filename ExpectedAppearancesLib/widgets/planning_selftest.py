@@ -23,6 +23,7 @@ from .planning_selftest_tools import (
     few_textures,
     lacks,
     let_events_pass,
+    open_case,
     open_panel,
     panel_with_models,
     saved_case,
@@ -82,7 +83,7 @@ def test_scan_is_saved_with_the_case_and_found_again(test) -> None:
         wait_until(test, lambda: panel.steps["case"].text == "Saved.")
         test.assertTrue((case.folder / "mri.nrrd").is_file())
         slicer.mrmlScene.Clear()
-        panel.open_folder(str(folder / "case"), take_over=True)
+        open_case(test, panel, folder / "case")
         shown = panel.parameters.mriVolume
         test.assertEqual(shown.GetName(), "T1")
         np.testing.assert_array_equal(slicer.util.arrayFromVolume(shown).shape, (20, 30, 40))
@@ -213,7 +214,7 @@ def test_run_is_found_again_and_cancelled(test) -> None:
         slicer.mrmlScene.Clear()
         test.assertEqual(panel.running(), frozenset())
 
-        panel.open_folder(str(folder / "case"), take_over=True)
+        open_case(test, panel, folder / "case")
         test.assertTrue(panel.ui.renderCancelButton.enabled)
         wait_until(test, lambda: panel.runs["render"].status.fraction > 0, 60)
         run = panel.runs["render"].run
@@ -221,7 +222,7 @@ def test_run_is_found_again_and_cancelled(test) -> None:
         slicer.mrmlScene.Clear()
         wait_until(test, lambda: not run.poll().state.active, 60)
 
-        panel.open_folder(str(folder / "case"), take_over=True)
+        open_case(test, panel, folder / "case")
         test.assertEqual(panel.steps["poses"].state, StepState.READY, panel.steps["poses"].text)
         test.assertIn("goes on where it was", panel.steps["poses"].text)
 
