@@ -9,12 +9,12 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
-import logging
 import os
-import queue
 import subprocess
 import sys
-import threading
+import tempfile
+from pathlib import Path
+from typing import BinaryIO
 
 from ..errors import InputError
 from .environment import environment_of, python_for_runs
@@ -24,7 +24,6 @@ TASKS = {
     "label maps": ("ExpectedAppearancesLib.masks.asked", "answering"),
     "surfaces": ("ExpectedAppearancesLib.mrml.segment_surface", "answering"),
 }
-_ENDED = object()
 
 
 class Worker:
@@ -36,7 +35,11 @@ class Worker:
     def __init__(self, task: str, urgent: bool = False):
         self._task, self._urgent = task, urgent
         self._process: subprocess.Popen | None = None
-        self._lines: queue.SimpleQueue = queue.SimpleQueue()
+        self._folder: tempfile.TemporaryDirectory | None = None
+        # The process writes into a file: a thread that reads a pipe would stand still in 3D Slicer, whose main thread
+        # keeps Python's lock while it waits for events.
+        self._answers: BinaryIO | None = None
+        self._line = b""
         self._begun: dict | None = None
         self._next: dict | None = None
 
@@ -53,18 +56,22 @@ class Worker:
 
     def poll(self) -> tuple[dict, dict] | None:
         """(question, its answer) where one has come in: {"answer"}, {"problem"}, or {"failed"}: the process ended."""
-        try:
-            line = self._lines.get_nowait()
-        except queue.Empty:
+        if self._begun is None:
             return None
-        question, self._begun = self._begun, None
-        if line is _ENDED:
-            self._process = None
+        ended = self._process.poll() is not None  # asked before the last line is read
+        self._line += self._answers.readline()
+        if self._line.endswith(b"\n"):
+            answer, self._line = json.loads(self._line), b""
+        elif ended:
+            kept = self._begun, self._next
+            self.stop()
+            self._begun, self._next = kept
             answer = {"failed": f"The process for {self._task} has ended."}
         else:
-            answer = json.loads(line)
+            return None
+        question, self._begun = self._begun, None
         self._send()
-        return None if question is None else (question, answer)
+        return question, answer
 
     def forget(self) -> None:
         """No answer is wanted any more. The process stays for the next question, unless it is at work."""
@@ -75,45 +82,44 @@ class Worker:
     def stop(self) -> None:
         """End the process; the next question starts another."""
         self._begun = self._next = None
-        self._lines = queue.SimpleQueue()  # what the reader of the old process still has to say is not heard
         process, self._process = self._process, None
-        if process is not None:
-            process.kill()
-            with contextlib.suppress(OSError):
-                process.stdin.close()
-            process.wait()
+        if process is None:
+            return
+        process.kill()
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+        process.wait()
+        self._answers.close()
+        self._line = b""
+        self._folder.cleanup()
 
     def _send(self) -> None:
         if self._begun is not None or self._next is None:
             return
-        self._begun, self._next = self._next, None
-        if self._process is None or self._process.poll() is not None:
+        question = self._next
+        if self._process is not None and self._process.poll() is not None:
+            self.stop()
+        if self._process is None:
             self._start()
-        try:
-            self._process.stdin.write((json.dumps(self._begun) + "\n").encode("utf-8"))
+        self._begun, self._next = question, None
+        with contextlib.suppress(OSError):  # it has ended: `poll` tells
+            self._process.stdin.write((json.dumps(question) + "\n").encode("utf-8"))
             self._process.stdin.flush()
-        except OSError:
-            logging.warning("Expected Appearances: the process for %s takes no questions", self._task)  # it has ended
 
     def _start(self) -> None:
         quiet = {"creationflags": subprocess.CREATE_NO_WINDOW} if os.name == "nt" else {}
-        self._lines = queue.SimpleQueue()
-        self._process = subprocess.Popen(
-            [python_for_runs(), "-m", __name__, self._task],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=environment_of("helper"),
-            **quiet,
-        )
-        threading.Thread(target=_read, args=(self._process.stdout, self._lines), daemon=True).start()
-
-
-def _read(stream, lines: queue.SimpleQueue) -> None:
-    with stream:
-        for line in stream:
-            lines.put(line)
-    lines.put(_ENDED)
+        self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
+        path = Path(self._folder.name) / "answers.txt"
+        with open(path, "wb") as stream:
+            self._process = subprocess.Popen(
+                [python_for_runs(), "-m", __name__, self._task],
+                stdin=subprocess.PIPE,
+                stdout=stream,
+                stderr=subprocess.DEVNULL,
+                env=environment_of("helper"),
+                **quiet,
+            )
+        self._answers = open(path, "rb")  # noqa: SIM115 (closed in stop)
 
 
 def main(argv: list[str]) -> int:
