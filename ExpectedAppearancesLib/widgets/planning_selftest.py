@@ -309,7 +309,7 @@ def _start_and_cancel_a_study(test, panel) -> None:
     test.assertTrue(ui.studyStart.enabled, ui.studyStart.toolTip)
     ui.studyStart.click()
     wait_until(
-        test, lambda: "models are to be trained" in ui.studyLine.text or "quick-strict" in ui.studyLine.text, 300
+        test, lambda: "models are to be trained" in ui.studyLine.text or "quick model without" in ui.studyLine.text, 300
     )
     test.assertEqual(panel.steps["validation"].state, StepState.RUNNING)
     for button in (ui.renderButton, ui.appearancesStart, ui.trainingStart):

@@ -97,8 +97,8 @@ class ValidationSection(Section):
         """How much work it is."""
         p = self.parameters
         models = textures * len(p.studyProtocols.value.split(","))
-        text = _("Trains {models} models as set above, {minutes:g} min each at most: {hours:.1f} hours.").format(
-            models=models, minutes=p.minutes, hours=models * p.minutes / 60
+        text = _("Trains {models} models as set above, {minutes:g} min each at most: {time}.").format(
+            models=models, minutes=p.minutes, time=_duration(models * p.minutes)
         )
         set_text(self.ui.studyHint, text if models else "")
 
@@ -122,3 +122,9 @@ class ValidationSection(Section):
             _("Measured on: {protocol}.").format(protocol=_(PROTOCOL_NAMES.get(shown.protocol, shown.protocol)))
         )
         return "<br>".join(lines)
+
+
+def _duration(minutes: float) -> str:
+    if minutes < 90:
+        return _("{minutes:.0f} min").format(minutes=max(minutes, 1))
+    return _("{hours:.1f} hours").format(hours=minutes / 60)
