@@ -279,7 +279,12 @@ def _validation(chosen: Chosen, recorded: Recorded) -> Step:
     if "study" in chosen.running:
         return Step(StepState.RUNNING, "A study is going on: for each texture a model is trained without it.")
     if recorded.verdict is None:
-        return Step(StepState.MISSING, "Train the model first." if recorded.model is None else "No figures yet.")
+        if recorded.study_stopped:
+            return Step(StepState.READY, "The study was stopped; it goes on where it was.")
+        if recorded.model is not None:
+            return Step(StepState.MISSING, "No figures yet.")
+        possible = recorded.index is not None and recorded.index["done"]
+        return Step(StepState.MISSING, "Train the model, or start a study." if possible else "Train the model first.")
     ready, reasons = recorded.verdict
     if recorded.validation == "stale":
         return Step(StepState.STALE, "The figures belong to an older model of this case.")

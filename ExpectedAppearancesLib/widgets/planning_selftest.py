@@ -92,6 +92,59 @@ def test_scan_is_saved_with_the_case_and_found_again(test) -> None:
         test.assertIsNone(panel.parameters.mriVolume)
 
 
+def test_a_case_is_opened_in_pieces_and_not_at_all_once_the_scene_is_closed(test) -> None:
+    with Folder() as folder:
+        panel, _node = panel_with_models(folder)
+        saved_case(test, panel, folder)
+        slicer.mrmlScene.Clear()
+        let_events_pass(0.2)
+        count = slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode")
+        panel.open_folder(str(folder / "case"), take_over=True)
+        test.assertTrue(panel.opening)
+        test.assertIn("being opened", panel.ui.nextLabel.text)
+        test.assertFalse(panel.ui.openCaseButton.enabled)
+        panel.open_folder(str(folder / "case"), take_over=True)  # a second time: it begins anew
+        wait_until(test, lambda: slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode") > count)
+        slicer.mrmlScene.Clear()
+        test.assertFalse(panel.opening)
+        let_events_pass(0.5)
+        test.assertEqual(slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode"), count)
+        test.assertEqual(panel.parameters.casePath, "")
+        test.assertTrue(panel.ui.openCaseButton.enabled)
+        open_case(test, panel, folder / "case")
+        test.assertEqual(panel.parameters.vesselsNode.GetName(), "Vessels")
+        test.assertEqual(slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode"), count + 2)
+
+
+def test_a_segment_becomes_vessels_in_a_process_of_its_own(test) -> None:
+    with Folder() as folder:
+        panel, _node = panel_with_models(folder)
+        segmentation = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Drawn")
+        voxels = np.zeros((20, 30, 40), np.int16)
+        voxels[5:15, 10:20, 8:30] = 1
+        labels = slicer.util.addVolumeFromArray(voxels, nodeClassName="vtkMRMLLabelMapVolumeNode")
+        slicer.modules.segmentations.logic().ImportLabelmapToSegmentationNode(labels, segmentation)
+        slicer.mrmlScene.RemoveNode(labels)
+        panel.open_folder(str(folder / "case"))
+        panel.ui.vesselsSelector.setCurrentNode(segmentation)
+        panel.refresh()
+        test.assertIn("is being made", panel.steps["case"].text)
+        test.assertIn("is being made", panel.ui.saveCaseButton.toolTip)
+        test.assertFalse(panel.ui.saveCaseButton.enabled)
+        wait_until(test, lambda: panel.ui.saveCaseButton.enabled)
+        extent = np.ptp(panel.session.mesh(panel.parameters, "vessels").vertices_mm, axis=0)
+        np.testing.assert_allclose(extent, (22, 10, 10), atol=1.5)
+        test.assertFalse(segmentation.GetSegmentation().ContainsRepresentation("Closed surface"))
+        segment = segmentation.GetSegmentation().GetNthSegment(0)
+        segment.GetRepresentation("Binary labelmap").Modified()
+        panel.refresh()
+        test.assertFalse(panel.ui.saveCaseButton.enabled)
+        slicer.mrmlScene.Clear()  # while it is being made
+        let_events_pass(0.5)
+        test.assertEqual(panel.steps["case"].state, StepState.MISSING)
+        test.assertEqual(panel.session.waiting(panel.parameters), "")
+
+
 def test_microscope_from_file_or_view(test) -> None:
     panel = open_panel()
     p = panel.parameters
@@ -131,8 +184,16 @@ def test_cameras_follow_the_sliders(test) -> None:
             expected = renderer.render(sampler.sample(0))
         np.testing.assert_array_equal(slicer.util.arrayFromVolume(shown_mask())[0], expected)
         test.assertTrue((expected == VESSELS).any())
+        p.poseIndex = 2
+        wait_until(test, lambda: "Camera 3" in panel.ui.lookCaption.text)
         p.lookThrough = p.showCameras = False
         wait_until(test, lambda: shown_mask() is None and shown_frustums() is None)
+        p.lookThrough = True
+        panel.refresh()
+        slicer.mrmlScene.Clear()  # while the label map is being drawn
+        let_events_pass(0.5)
+        test.assertIsNone(shown_mask())
+        test.assertEqual(panel.ui.lookCaption.text, "")
 
 
 def test_textures_are_listed_and_labelled(test) -> None:

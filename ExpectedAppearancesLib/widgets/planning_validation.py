@@ -49,7 +49,7 @@ class ValidationSection(Section):
         self._show_hint(len(textures))
         allow(
             self.ui.showFiguresButton,
-            "" if rows else _("Train the model first: there are no figures yet."),
+            "" if rows else _("There are no figures yet: train the model, or start a study."),
             _("Show the table of figures, and the plot of the mean ADD of each texture."),
         )
         if rows and rows != self._shown and charts.table_of(self.panel.scene):
@@ -97,9 +97,9 @@ class ValidationSection(Section):
         """How much work it is."""
         p = self.parameters
         models = textures * len(p.studyProtocols.value.split(","))
-        text = _("Trains {models} models as set above, {minutes:g} min each at most: {time}.").format(
-            models=models, minutes=p.minutes, time=_duration(models * p.minutes)
-        )
+        text = _(
+            "Trains {models} models as set above: {time} of training, and some minutes more to test each of them."
+        ).format(models=models, time=_duration(models * p.minutes))
         set_text(self.ui.studyHint, text if models else "")
 
     def _fill(self, rows: list) -> tuple:
