@@ -152,6 +152,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
+  ExpectedAppearancesLib/textures/photograph.py
   ExpectedAppearancesLib/textures/proposal.py
   ExpectedAppearancesLib/textures/thumbnails.py
   ExpectedAppearancesLib/widgets/__init__.py

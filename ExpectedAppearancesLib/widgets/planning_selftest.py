@@ -140,8 +140,7 @@ def test_a_segment_becomes_vessels_in_a_process_of_its_own(test) -> None:
         panel.refresh()
         test.assertFalse(panel.ui.saveCaseButton.enabled)
         slicer.mrmlScene.Clear()  # while it is being made
-        let_events_pass(0.5)
-        test.assertEqual(panel.steps["case"].state, StepState.MISSING)
+        wait_until(test, lambda: panel.steps["case"].state is StepState.MISSING)
         test.assertEqual(panel.session.waiting(panel.parameters), "")
 
 
@@ -234,7 +233,9 @@ def test_photograph_becomes_a_texture(test) -> None:
         test.assertFalse(panel.ui.addPhotographButton.enabled)
         test.assertFalse(panel.ui.texturesSection.collapsed)  # where the photograph is saved
         panel.ui.useLabelsButton.click()
-        test.assertEqual(labelling_.nodes, {})
+        panel.refresh()
+        test.assertFalse(panel.ui.useLabelsButton.enabled)  # while it is being saved
+        wait_until(test, lambda: labelling_.nodes == {})
         panel.unfold("textures")
         wait_until(test, lambda: panel.ui.texturesList.count == 2)
         np.testing.assert_array_equal(files.read_label_map(folder / "textures" / f"Foto_1{LABELS_SUFFIX}"), proposed)

@@ -88,7 +88,7 @@ class ValidationSection(Section):
         before = self.panel.steps["appearances"]
         problem = in_the_way(self.panel, "study")
         if not problem and before.state is not StepState.DONE:
-            problem = before.text
+            problem = self.reason_of("appearances")
         if not problem and textures < LEAST_TEXTURES:
             problem = _("A study leaves one texture out: make expected appearances of at least 2 textures.")
         return problem or self.panel.help.reason("training")
