@@ -106,6 +106,17 @@ def test_a_process_that_ended_is_told_and_replaced(worker, folder):
     assert question is third and "answer" in answer
 
 
+def test_a_process_that_cannot_be_started_is_told_too(worker, folder, monkeypatch):
+    monkeypatch.setattr(workers, "python_for_runs", lambda: str(folder / "no python"))
+    first, second = questions(folder, 2)
+    worker.ask(first)
+    assert worker.waiting
+    assert set(next_answer(worker)[1]) == {"failed"}
+    monkeypatch.undo()
+    worker.ask(second)
+    assert "answer" in next_answer(worker)[1]
+
+
 def test_what_is_forgotten_is_never_answered(worker, folder):
     first, second = questions(folder, 2)
     worker.ask(first)

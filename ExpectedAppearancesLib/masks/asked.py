@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,6 +41,7 @@ def label_map(answer: str) -> np.ndarray:
 def answering() -> Callable[[dict], str]:
     """The function that answers: path of the label map. The renderer of the last question is kept."""
     kept: list = [None, None]
+    turns = itertools.cycle((0, 1))  # what is answered is read while the next one is being drawn
 
     def answer(asked: dict) -> str:
         key = {name: asked[name] for name in ("folder", "camera", "outward_axis")}
@@ -51,7 +53,7 @@ def answering() -> Callable[[dict], str]:
             vessels = _mesh(folder, "vessels")
             parenchyma = cortex or disc_under_vessels(vessels, np.array(asked["outward_axis"]))
             kept[:] = key, MaskRenderer(vessels, parenchyma, Camera.from_dict(asked["camera"]))
-        path = folder / "labels.npy"
+        path = folder / f"labels.{next(turns)}.npy"
         np.save(path, kept[1].render(np.array(asked["camera_from_world"])))
         return str(path)
 

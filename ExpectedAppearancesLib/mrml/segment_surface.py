@@ -5,6 +5,7 @@ The scene's thread copies the segment's voxels to a file, a piece at a time, and
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -54,10 +55,14 @@ class SegmentSurfaces:
             "name": node.GetName(),
         }
         planes = max(1, PIECE_VOXELS // max(1, voxels[0].size))
-        with open(question["voxels"], "wb") as stream:
-            for k in range(0, len(voxels), planes):
-                stream.write((voxels[k : k + planes] == value).tobytes())
-                yield
+        try:
+            with open(question["voxels"], "wb") as stream:
+                for k in range(0, len(voxels), planes):
+                    stream.write((voxels[k : k + planes] == value).tobytes())
+                    yield
+        except OSError:  # the disk is full
+            self._taken = (version, None, None)
+            return
         self._asked = version
         self._ask(question)
 
@@ -68,8 +73,12 @@ class SegmentSurfaces:
             return
         if "problem" in answer:
             self._taken = (version, None, InputError(answer["problem"]))
-        else:  # without an answer, where the process has failed, the surface is made in the scene's thread
-            self._taken = (version, surface_of(answer["answer"]) if "answer" in answer else None, None)
+            return
+        # Without an answer, where the process has failed, the surface is made in the scene's thread.
+        self._taken = (version, None, None)
+        if "answer" in answer:
+            with contextlib.suppress(OSError):
+                self._taken = (version, surface_of(answer["answer"]), None)
 
     def forget(self) -> None:
         """Nothing that was asked for will come."""

@@ -58,8 +58,8 @@ class Worker:
         """(question, its answer) where one has come in: {"answer"}, {"problem"}, or {"failed"}: the process ended."""
         if self._begun is None:
             return None
-        ended = self._process.poll() is not None  # asked before the last line is read
-        self._line += self._answers.readline()
+        ended = self._process is None or self._process.poll() is not None  # asked before the last line is read
+        self._line += self._answers.readline() if self._process else b""
         if self._line.endswith(b"\n"):
             answer, self._line = json.loads(self._line), b""
         elif ended:
@@ -99,10 +99,10 @@ class Worker:
         question = self._next
         if self._process is not None and self._process.poll() is not None:
             self.stop()
-        if self._process is None:
-            self._start()
         self._begun, self._next = question, None
-        with contextlib.suppress(OSError):  # it has ended: `poll` tells
+        with contextlib.suppress(OSError):  # it could not be started or has ended: `poll` tells
+            if self._process is None:
+                self._start()
             self._process.stdin.write((json.dumps(question) + "\n").encode("utf-8"))
             self._process.stdin.flush()
 
