@@ -10,7 +10,7 @@ from test_refinement import CAMERA, CORTEX, EXPOSED, MESH, TRUE, disturbed, erro
 from ExpectedAppearancesLib.geometry.silhouette import Silhouette
 from ExpectedAppearancesLib.masks.labels import BACKGROUND, PARENCHYMA, VESSELS
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
-from ExpectedAppearancesLib.registration.contrast import REACH_PX, ContrastAligner
+from ExpectedAppearancesLib.registration.contrast import NEAR_PX, ContrastAligner
 
 SHARP = CAMERA.resized(256, 256)
 
@@ -48,6 +48,15 @@ def test_a_pose_that_is_off_is_brought_back_whatever_the_colours(labels, colours
     assert found.moved_mm > 0.5
 
 
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_a_pose_that_is_far_off_is_brought_back(labels, seed):
+    """Farther than edges are sought at first: vessels that lie side by side are then taken for each other."""
+    start = disturbed(seed, 3.0, (1.5, 1.5, 4.0))
+    found = aligned(start, frame(labels, (110, 40, 60), (215, 150, 130), seed=seed))
+    assert error_mm(start) > 4.5 and error_mm(found.fit.camera_from_world) < 0.3
+    assert found.matched > 0.7
+
+
 def test_a_true_pose_stays(labels):
     found = aligned(TRUE, frame(labels, (110, 40, 60), (215, 150, 130)))
     assert error_mm(found.fit.camera_from_world) < 0.2 and found.moved_mm < 0.5
@@ -65,7 +74,7 @@ def test_where_no_vessel_shows_little_matches(labels):
 def test_a_black_frame_changes_nothing():
     found = aligned(TRUE, np.zeros((256, 256, 3), np.uint8))
     np.testing.assert_array_equal(found.fit.camera_from_world, TRUE)
-    assert (found.matched, found.residual_px, found.separation, found.moved_mm) == (0.0, REACH_PX, 0.0, 0.0)
+    assert (found.matched, found.residual_px, found.separation, found.moved_mm) == (0.0, NEAR_PX, 0.0, 0.0)
 
 
 def test_covariance_grows_where_half_of_the_vessels_are_covered(labels):

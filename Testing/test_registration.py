@@ -153,6 +153,16 @@ def test_confidence_is_calibrated_and_its_threshold_keeps_bad_poses_out():
     assert confidence.probability(None) == 0.0
 
 
+def test_the_sure_frames_do_not_let_an_unsure_one_through():
+    """Where evidence tells nearly all, 99 % of the accepted are good even with some at a probability of one half."""
+    rng = np.random.default_rng(1)
+    quality = np.concatenate([rng.normal(6, 1, 1500), rng.normal(-6, 1, 500), rng.normal(0, 0.3, 30)])
+    good = np.concatenate([np.ones(1500, bool), np.zeros(500, bool), rng.uniform(size=30) < 0.5])
+    confidence = calibrate(quality[:, None], good)
+    assert confidence.threshold >= 0.9
+    assert confidence.probability(np.array([0.0])) < confidence.threshold
+
+
 def test_implausible_views_are_told():
     plausible = PlausibleView(CENTRE, np.array([0, 0, 1.0]), 60.0, (80.0, 140.0))
     from_above = pose_from_rotation(

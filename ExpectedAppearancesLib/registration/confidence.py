@@ -8,6 +8,7 @@ import numpy as np
 
 GOOD_ADD_MM = 3.0
 PRECISION_WANTED = 0.99  # of accepted validation views, negatives among them
+LEAST_PROBABILITY = 0.9  # of any single accepted frame, however well the sure ones make up for it
 
 
 def logistic(x: np.ndarray) -> np.ndarray:
@@ -64,13 +65,13 @@ def calibrate(evidence: np.ndarray, good: np.ndarray) -> Confidence:
 
 
 def _threshold(probability: np.ndarray, good: np.ndarray) -> float:
-    """The lowest threshold at which accepted views are good often enough, and at least one half."""
+    """The lowest threshold at which accepted views are good often enough, and at least LEAST_PROBABILITY."""
     order = np.argsort(-probability)
     precision = np.cumsum(good[order]) / np.arange(1, len(order) + 1)
     enough = np.nonzero(precision >= PRECISION_WANTED)[0]
     if not len(enough):
         return 0.99
-    return float(min(max(probability[order[enough[-1]]], 0.5), 0.99))
+    return float(min(max(probability[order[enough[-1]]], LEAST_PROBABILITY), 0.99))
 
 
 def calibration_error(probability: np.ndarray, good: np.ndarray, bins: int = 10) -> float:

@@ -19,15 +19,16 @@ from .descent import Descent
 from .pnp import PoseFit, projection_jacobian
 
 SHARPER = 2  # frames are looked at in so many times the size that the network reads
+NEAR_PX, FAR_PX = 4.0, 8.0  # how far edges are sought from the outline, to both sides
+SURE = 0.8  # matched by so much, a near search has found the place
+STEPS = 4  # of each search
 POINTS = 400  # of the outline, at most
-REACH_PX, STEP_PX = 4.0, 0.5  # samples along a normal, to both sides
-OFFSETS_PX = np.arange(-REACH_PX, REACH_PX + STEP_PX / 2, STEP_PX)
-INSIDE, BEYOND = slice(2, 7), slice(10, 15)  # of these, from 1 to 3 px off the outline
-WINDOW_PX = 2.0  # inside and outside are means over so much
+STEP_PX = 0.5  # between samples along a normal
+NEAREST_PX, FARTHEST_PX = 1.0, 3.0  # off the outline: where the colours of its inside and outside are taken
+WINDOW_PX = 2.0  # an edge lies between the means over so much
 SIGMA_PX = 0.6  # error of an edge that was found
 INDEPENDENT = 60.0  # the whole outline counts as this many independent points: neighbours err together
 PRIOR = 100.0  # covariance of the fit is taken this many times: its own edges lean on its pose
-ITERATIONS = 4
 LEAST_POINTS = 50
 DARK = 12  # grey level: no tissue is darker, the border of the field is
 
@@ -55,21 +56,24 @@ class ContrastAligner:
         self.camera = camera
 
     def align(self, fit: PoseFit, image_rgb: np.ndarray) -> Contrast:
-        """Gauss-Newton from `fit`, which stays a weak prior; at half the size of the uint8 (H, W, 3), then at it."""
-        small = self.camera.resized(self.camera.width // 2, self.camera.height // 2)
-        half = cv2.resize(image_rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)
-        near = self._descend(fit, fit.camera_from_world, half, small)
-        if near is None:
-            return Contrast(fit, 0.0, REACH_PX, 0.0, 0.0)
-        found = self._descend(fit, near.fit.camera_from_world, image_rgb, self.camera)
-        return near if found is None else found
+        """Gauss-Newton from `fit`, which stays a weak prior, on the uint8 (H, W, 3) image: halved, then as it is.
 
-    def _descend(self, fit: PoseFit, start: np.ndarray, image_rgb: np.ndarray, camera: Camera) -> Contrast | None:
-        image = cv2.GaussianBlur(image_rgb, (0, 0), 0.7).astype(np.float32)
-        red, green, blue = cv2.split(image_rgb)
-        lightest = cv2.max(cv2.max(red, green), blue)
-        dark = cv2.erode((lightest < DARK).astype(np.uint8), np.ones((3, 3), np.uint8))
-        dark = cv2.dilate(dark, np.ones((5, 5), np.uint8))
+        A far search strays where vessels are many and faint: it is made where a near one matched little, and what
+        matches better goes on.
+        """
+        half = _Picture.of(image_rgb, self.camera, 2)
+        found = self._descend(fit, fit.camera_from_world, half, NEAR_PX)
+        if found is None or found.matched < SURE:
+            far = self._descend(fit, fit.camera_from_world, half, FAR_PX)
+            far = far and self._descend(fit, far.fit.camera_from_world, half, NEAR_PX)
+            if far and (found is None or far.matched > found.matched):
+                found = far
+        if found is None:
+            return Contrast(fit, 0.0, NEAR_PX, 0.0, 0.0)
+        sharp = _Picture.of(image_rgb, self.camera, 1)
+        return self._descend(fit, found.fit.camera_from_world, sharp, NEAR_PX) or found
+
+    def _descend(self, fit: PoseFit, start: np.ndarray, picture: _Picture, reach_px: float) -> Contrast | None:
         edges, inner = self._silhouette.edges_with_inside(start)
         every = len(edges) // POINTS + 1
         centre = fit.centre_world_mm
@@ -79,21 +83,22 @@ class ContrastAligner:
         count = len(edges[::every])
         relative = (corners[:, :count] + corners[:, count : 2 * count]) / 2
         descent = Descent(fit, start, PRIOR)
+        camera, search = picture.camera, None
         focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-        for _ in range(ITERATIONS):
+        for _ in range(STEPS):
             seen = descent.rotation @ corners + descent.position[:, None]
             pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
             a, b, within = (pixels[:, i * count : (i + 1) * count] for i in range(3))
-            normals = _outward(a, b, within)
-            profile = _Profile((a + b) / 2, normals, image, dark)
-            if profile.on_tissue.sum() < LEAST_POINTS:
+            points, normals = (a + b) / 2, _outward(a, b, within)
+            search = search or _EdgeSearch.for_colours(picture, points, normals, reach_px)
+            found = search and search.edges(points, normals)
+            if not found:
                 return None
-            offsets_px, weight = profile.edges()
+            offsets_px, weight, tissue = found
             turned = descent.rotation @ relative
             jacobian = projection_jacobian(turned, turned + descent.position[:, None], focal)
             gradient = normals[0] * jacobian[:, 0] + normals[1] * jacobian[:, 1]
-            count_as = INDEPENDENT / (SIGMA_PX**2 * profile.on_tissue.sum())
-            if descent.step(gradient, weight * count_as, offsets_px):
+            if descent.step(gradient, weight * (INDEPENDENT / (SIGMA_PX**2 * tissue)), offsets_px):
                 break
         refined = descent.result()
         if refined is None:
@@ -101,9 +106,9 @@ class ContrastAligner:
         used = weight > 0
         return Contrast(
             refined,
-            float(weight.sum() / profile.on_tissue.sum()),
-            float(np.abs(offsets_px[used]).mean()) if used.any() else REACH_PX,
-            profile.separation,
+            float(weight.sum() / tissue),
+            float(np.abs(offsets_px[used]).mean()) if used.any() else reach_px,
+            search.separation,
             descent.moved_mm(self._radius_mm),
         )
 
@@ -117,40 +122,93 @@ def _outward(a_px: np.ndarray, b_px: np.ndarray, within_px: np.ndarray) -> np.nd
     return np.stack([y * scale, -x * scale])
 
 
-class _Profile:
-    """The image along the normals (2, E) of points (2, E), from REACH_PX inside to as much outside."""
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A frame as `camera` takes it: image float32 (H, W, 3), a little blurred; dark uint8 (H, W), 1 off the field."""
 
-    def __init__(self, points_px: np.ndarray, normals: np.ndarray, image: np.ndarray, dark: np.ndarray):
-        where = points_px[:, :, None] + normals[:, :, None] * OFFSETS_PX
-        where = cv2.merge([where[0].astype(np.float32), where[1].astype(np.float32)])
-        colours = cv2.remap(image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        outside = cv2.remap(dark, where, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
-        self.on_tissue = ~(outside > 0).any(axis=1)
+    camera: Camera
+    image: np.ndarray
+    dark: np.ndarray
+
+    @staticmethod
+    def of(image_rgb: np.ndarray, camera: Camera, shrink: int) -> _Picture:
+        if shrink > 1:
+            camera = camera.resized(camera.width // shrink, camera.height // shrink)
+            image_rgb = cv2.resize(image_rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        red, green, blue = cv2.split(image_rgb)
+        lightest = cv2.max(cv2.max(red, green), blue)
+        dark = cv2.erode((lightest < DARK).astype(np.uint8), np.ones((3, 3), np.uint8))
+        dark = cv2.dilate(dark, np.ones((5, 5), np.uint8))
+        return _Picture(camera, cv2.GaussianBlur(image_rgb, (0, 0), 0.7).astype(np.float32), dark)
+
+
+@dataclass(frozen=True, eq=False)
+class _EdgeSearch:
+    """Looks along normals for the vessels' edges in values (H, W), the picture on the colour axis of this frame."""
+
+    values: np.ndarray
+    dark: np.ndarray
+    separation: float
+    offsets_px: np.ndarray
+    reach_px: float
+
+    @staticmethod
+    def for_colours(
+        picture: _Picture, points_px: np.ndarray, normals: np.ndarray, reach_px: float
+    ) -> _EdgeSearch | None:
+        """The axis on which colours beside the outline's points (2, E) differ most; None where too little is tissue."""
+        beside = np.arange(NEAREST_PX, FARTHEST_PX + STEP_PX / 2, STEP_PX)
+        where = _along(points_px, normals, np.concatenate([-beside, beside]))
+        colours = cv2.remap(picture.image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        on_tissue = _on_tissue(picture.dark, where)
+        if on_tissue.sum() < LEAST_POINTS:
+            return None
         # Differences across the outline, so that light which changes from place to place does not count.
-        across = (colours[:, INSIDE].mean(axis=1) - colours[:, BEYOND].mean(axis=1))[self.on_tissue].astype(float)
-        mean = across.mean(axis=0) if len(across) else np.zeros(3)
+        inside, outside = colours[:, : len(beside)].mean(axis=1), colours[:, len(beside) :].mean(axis=1)
+        across = (inside - outside)[on_tissue].astype(float)
+        mean = across.mean(axis=0)
         apart = across - mean
-        spread = apart.T @ apart / (len(across) - 1) + 4 * np.eye(3) if len(across) > 3 else np.eye(3)
-        axis = np.linalg.solve(spread, mean)
-        self._values = colours @ axis
-        self._expected = max(float(mean @ axis), 1e-9)
-        self.separation = float(np.sqrt(self._expected))
+        axis = np.linalg.solve(apart.T @ apart / (len(across) - 1) + 4 * np.eye(3), mean)
+        values = cv2.transform(picture.image, axis[None].astype(np.float32))
+        offsets_px = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
+        return _EdgeSearch(values, picture.dark, float(np.sqrt(max(mean @ axis, 0.0))), offsets_px, reach_px)
 
-    def edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Offset of the step along each normal that is most like the expected one, px (E,), and its weight (E,)."""
+    def edges(self, points_px: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, int] | None:
+        """Offset of the step along each normal that is most like the expected one, px (E,), its weight (E,), and how
+        many points lie on tissue; None when these are too few."""
+        where = _along(points_px, normals, self.offsets_px)
+        on_tissue = _on_tissue(self.dark, where)
+        tissue = int(on_tissue.sum())
+        if tissue < LEAST_POINTS:
+            return None
+        values = cv2.remap(self.values, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        middle, nearest, farthest = len(self.offsets_px) // 2, round(NEAREST_PX / STEP_PX), round(FARTHEST_PX / STEP_PX)
+        inside = values[:, middle - farthest : middle - nearest + 1].mean(axis=1)
+        outside = values[:, middle + nearest : middle + farthest + 1].mean(axis=1)
+        expected = max(float((inside - outside) @ on_tissue) / tissue, 1e-9)
         window = round(WINDOW_PX / STEP_PX)
         # Column i: the sum of the `window` samples from the i-th on.
-        sums = self._values[:, : 1 - window].copy()
-        for i in range(1, window):
-            sums += self._values[:, i : i + sums.shape[1]]
-        at = np.arange(window, len(OFFSETS_PX) - window)
-        response = (sums[:, : len(at)] - sums[:, window + 1 :]) / (window * self._expected)
+        sums = cv2.boxFilter(values, -1, (window, 1), anchor=(0, 0), normalize=False)[:, : 1 - window]
+        at = np.arange(window, len(self.offsets_px) - window)
+        response = (sums[:, : len(at)] - sums[:, window + 1 :]) / (window * expected)
         best, rows = np.clip(response.argmax(axis=1), 1, len(at) - 2), np.arange(len(response))
         before, peak, after = (response[rows, best + i] for i in (-1, 0, 1))
         bend = before - 2 * peak + after
         between = np.where(bend < -1e-9, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
-        offsets_px = OFFSETS_PX[at[best]] + STEP_PX * np.clip(between, -1, 1)
-        farthest = REACH_PX - WINDOW_PX + STEP_PX
-        near = np.clip(1 - (offsets_px / farthest) ** 2, 0, 1) ** 2
+        offsets_px = self.offsets_px[at[best]] + STEP_PX * np.clip(between, -1, 1)
+        last = self.reach_px - WINDOW_PX + STEP_PX
+        near = np.clip(1 - (offsets_px / last) ** 2, 0, 1) ** 2
         is_peak = (peak >= before) & (peak >= after)
-        return offsets_px, np.clip(peak, 0, 1.5) * near * is_peak * self.on_tissue
+        return offsets_px, np.clip(peak, 0, 1.5) * near * is_peak * on_tissue, tissue
+
+
+def _along(points_px: np.ndarray, normals: np.ndarray, offsets_px: np.ndarray) -> np.ndarray:
+    """Positions (E, K, 2) float32 at those offsets (K,) along the normals (2, E) of points (2, E)."""
+    x, y = (points_px[i][:, None] + normals[i][:, None] * offsets_px for i in range(2))
+    return cv2.merge([x.astype(np.float32), y.astype(np.float32)])
+
+
+def _on_tissue(dark: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """bool (E,): whether no position (E, K, 2) of a point lies off the field."""
+    off = cv2.remap(dark, where, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
+    return ~(off > 0).any(axis=1)

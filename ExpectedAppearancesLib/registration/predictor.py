@@ -20,7 +20,7 @@ from .covariance import CovarianceModel
 from .decoding import PlausibleView, read_dense, read_regression
 from .refinement import VesselAligner
 
-FORMAT_VERSION = 3  # 3: poses are refined on the frame itself, and confidence asks how well that went
+FORMAT_VERSION = 4  # 4: poses are sought farther off on the frame itself, and confidence was calibrated on that
 EXPOSED_VESSELS_NAME = "exposed_vessels.vtp"
 ASPECT_TOLERANCE = 0.01
 
