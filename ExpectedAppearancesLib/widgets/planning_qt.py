@@ -31,7 +31,7 @@ SYMBOLS = {
     StepState.STALE: "!",
     StepState.DONE: "✓",
 }
-STEP_BUDGET_S = 0.03
+STEP_BUDGET_S = 0.015
 POLL_ANSWER_MS = 15
 
 
@@ -71,7 +71,7 @@ def quiet(*widgets) -> Iterator[None]:
 
 
 class Stepper:
-    """Works a generator off in pieces of some 30 ms between the events of the GUI, without a thread: MRML has one."""
+    """Works a generator off in pieces of some 15 ms between the events of the GUI, without a thread: MRML has one."""
 
     def __init__(self) -> None:
         self._steps: Iterator | None = None

@@ -343,9 +343,9 @@ def test_from_models_to_a_trained_model(test) -> None:
             button.click()
             end = time.monotonic() + LONGEST_WAIT_S
             while panel.runs[kind].active or kind in panel.running():
-                begin = time.monotonic()
+                begin = time.thread_time()  # what other processes take is not the panel's
                 slicer.app.processEvents()
-                longest_s = max(longest_s, time.monotonic() - begin)
+                longest_s = max(longest_s, time.thread_time() - begin)
                 time.sleep(0.01)
                 test.assertLess(time.monotonic(), end, f"{name} takes too long")
             panel.refresh()
