@@ -56,7 +56,11 @@ def run_jobs(jobs: Sequence, work: Work, executor: str, progress: ProgressFuncti
     """
     if executor == LOCAL:
         for i, job in enumerate(jobs):
-            work(job, lambda fraction, text, i=i: progress((i + fraction) / len(jobs), text), lambda: False)
+
+            def report(fraction: float, text: str, i: int = i) -> None:
+                progress((i + fraction) / len(jobs), f"{i + 1} of {len(jobs)}: {text}")
+
+            work(job, report, lambda: False)
             progress((i + 1) / len(jobs), f"{i + 1} of {len(jobs)} done")
         return
     if not jobs:

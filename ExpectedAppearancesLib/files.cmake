@@ -84,6 +84,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/live/trust.py
   ExpectedAppearancesLib/live/worker.py
   ExpectedAppearancesLib/masks/__init__.py
+  ExpectedAppearancesLib/masks/asked.py
   ExpectedAppearancesLib/masks/exposed.py
   ExpectedAppearancesLib/masks/labels.py
   ExpectedAppearancesLib/masks/renderer.py
@@ -116,6 +117,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/planning_adopt.py
   ExpectedAppearancesLib/mrml/planning_session.py
   ExpectedAppearancesLib/mrml/scene.py
+  ExpectedAppearancesLib/mrml/segment_surface.py
   ExpectedAppearancesLib/poses/__init__.py
   ExpectedAppearancesLib/poses/craniotomy.py
   ExpectedAppearancesLib/poses/sampling.py
@@ -145,10 +147,12 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/runs/runner.py
   ExpectedAppearancesLib/runs/state.py
   ExpectedAppearancesLib/runs/system_report.py
+  ExpectedAppearancesLib/runs/worker.py
   ExpectedAppearancesLib/textures/__init__.py
   ExpectedAppearancesLib/textures/generate.py
   ExpectedAppearancesLib/textures/library.py
   ExpectedAppearancesLib/textures/painting.py
+  ExpectedAppearancesLib/textures/photograph.py
   ExpectedAppearancesLib/textures/proposal.py
   ExpectedAppearancesLib/textures/thumbnails.py
   ExpectedAppearancesLib/widgets/__init__.py
@@ -168,6 +172,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/widgets/planning_devices.py
   ExpectedAppearancesLib/widgets/planning_help.py
   ExpectedAppearancesLib/widgets/planning_labelling.py
+  ExpectedAppearancesLib/widgets/planning_look.py
   ExpectedAppearancesLib/widgets/planning_panel.py
   ExpectedAppearancesLib/widgets/planning_poses.py
   ExpectedAppearancesLib/widgets/planning_qt.py

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections import Counter
 from dataclasses import replace
 
@@ -14,16 +15,19 @@ from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.case import recorded
-from ExpectedAppearancesLib.case.steps import StepState
+from ExpectedAppearancesLib.case.steps import Step, StepState
+from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import read_camera
+from ExpectedAppearancesLib.runs.worker import Worker
 
 slicer = pytest.importorskip("slicer")
 import vtk  # noqa: E402 (after the skip)
-from planning_scene import LPS, Source, Where, parameters, save, turned  # noqa: E402
+from planning_scene import LPS, Source, Where, add_transform, new_scene, parameters, save, turned  # noqa: E402
 from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import mri, planning, planning_session  # noqa: E402
-from ExpectedAppearancesLib.mrml.planning_adopt import adopt  # noqa: E402
+from ExpectedAppearancesLib.mrml.planning_adopt import adopt, adopting  # noqa: E402
+from ExpectedAppearancesLib.mrml.segment_surface import SegmentSurfaces  # noqa: E402
 
 
 def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
@@ -46,6 +50,24 @@ def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
         assert adopt(session, p, scene) is not None
         assert session.steps(p)["case"].state is StepState.DONE
         assert scene.GetNumberOfNodesByClass("vtkMRMLModelNode") == count + 2
+
+
+def test_a_case_that_is_not_opened_to_the_end_leaves_nothing_in_the_scene(scene, planned, tmp_path):
+    session, p = planned
+    p.casePath = str(tmp_path / "case")
+    folder = str(save(session, p, tmp_path).folder)
+    before, nodes = parameters(), scene.GetNumberOfNodes()
+    assert len(list(adopting(session, parameters(), folder, scene))) > 5
+    assert scene.GetNumberOfNodes() > nodes
+    for done in range(5):
+        other, chosen = new_scene(), parameters()
+        there = other.GetNumberOfNodes()
+        opening = adopting(session, chosen, folder, other)
+        for _piece in range(done + 1):
+            next(opening)
+        opening.close()
+        assert other.GetNumberOfNodes() == there, done
+        assert vars(chosen) == vars(before), done
 
 
 def test_rendered_poses_are_those_that_were_planned(planned, tmp_path):
@@ -220,27 +242,74 @@ def test_prepared_in_pieces_it_answers_at_once(scene, planned, tmp_path, counted
     assert session.steps(p)["poses"].state is StepState.MISSING
 
 
-def test_a_segment_that_is_drawn_on_waits_for_the_end_of_a_run(scene, planned, counted):
+def test_the_surface_of_a_segment_comes_from_a_process_and_an_outdated_one_never(scene, planned, tmp_path):
     session, p = planned
     image = slicer.vtkOrientedImageData()
-    image.SetDimensions(12, 12, 12)
+    image.SetExtent(3, 14, -2, 9, 0, 11)
+    image.SetSpacing(2.0, 1.0, 0.5)
+    image.SetOrigin(5.0, -7.0, 11.0)
     image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
     voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(12, 12, 12)
     voxels[:] = 0
-    voxels[3:8, 3:8, 3:8] = 1
+    voxels[3:8, 3:7, 3:9] = 1
     node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "S")
     node.CreateDefaultDisplayNodes()
-    p.vesselsSegmentId = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
-    p.vesselsNode = node
-    session.busy = True
-    before = session.mesh(p, "vessels")
-    assert counted() == {"world_mesh": 1}  # newly chosen: it is looked at all the same
-    segment = node.GetSegmentation().GetSegment(p.vesselsSegmentId)
-    segment.GetRepresentation(node.GetSegmentation().GetSourceRepresentationName()).Modified()
-    assert session.mesh(p, "vessels") is before and counted() == {}
-    session.busy = False
-    session.mesh(p, "vessels")
-    assert counted() == {"world_mesh": 1}
+    segment_id = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
+    node.SetAndObserveTransformNodeID(add_transform(scene, turned()).GetID())
+    expected = planning.world_mesh(node, segment_id)
+    p.vesselsSegmentId, p.vesselsNode = segment_id, node
+
+    asked: list[dict] = []
+    worker, session.surfaces = Worker("surfaces"), SegmentSurfaces(asked.append)
+
+    def answered() -> tuple[dict, dict]:
+        list(session.surfaces.asking(node, segment_id, tmp_path))
+        worker.ask(asked[-1])
+        end = time.monotonic() + 300
+        while not (found := worker.poll()):
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        return found
+
+    def draw() -> None:
+        segment = node.GetSegmentation().GetSegment(segment_id)
+        segment.GetRepresentation(node.GetSegmentation().GetSourceRepresentationName()).Modified()
+
+    try:
+        assert session.steps(p)["case"] == Step(StepState.RUNNING, "The surface of the segment is being made.")
+        with pytest.raises(InputError, match="is being made"):
+            session.mesh(p, "vessels")
+        first = answered()
+        assert not session.surfaces.to_ask(node, segment_id)
+        session.surfaces.take(*first)
+        made = session.mesh(p, "vessels")
+        np.testing.assert_allclose(made.vertices_mm, expected.vertices_mm, atol=1e-4)
+        np.testing.assert_array_equal(made.triangles, expected.triangles)
+        assert session.steps(p)["case"].state is StepState.MISSING  # a folder is to be chosen: nothing is waited for
+
+        draw()
+        assert session.surfaces.to_ask(node, segment_id)
+        assert session.mesh(p, "vessels") is made  # what is drawn in the views stays until the new one comes
+        assert session.steps(p)["case"].state is StepState.RUNNING
+        outdated = answered()
+        draw()
+        voxels[:] = 0
+        newest = answered()
+        session.surfaces.take(*outdated)
+        assert session.steps(p)["case"].state is StepState.RUNNING
+        session.surfaces.take(*newest)
+        with pytest.raises(InputError, match="S: "):
+            session.mesh(p, "vessels")
+
+        draw()
+        voxels[4:9, 4:8, 4:9] = 1
+        list(session.surfaces.asking(node, segment_id, tmp_path))
+        session.surfaces.take(asked[-1], {"failed": "ended"})
+        np.testing.assert_array_equal(
+            session.mesh(p, "vessels").vertices_mm, planning.world_mesh(node, segment_id).vertices_mm
+        )
+    finally:
+        worker.stop()
 
 
 def test_the_session_loads_nothing_heavy():

@@ -156,7 +156,16 @@ STEEPER = {**POSES, "ranges": RANGES | {"tilt_max_deg": 60.0}}
         # Validation
         (lambda c, r: (c, replace(r, verdict=(False, ("a", "b")))), "validation", MISSING, "2 limits"),
         (lambda c, r: (c, replace(r, validation="stale")), "validation", STALE, "older"),
-        (lambda c, r: (c, replace(r, verdict=None, model=None)), "validation", MISSING, "Train"),
+        (lambda c, r: (c, replace(r, verdict=None, model=None)), "validation", MISSING, "or start a study"),
+        (
+            lambda c, r: (c, replace(r, verdict=None, model=None, index=None)),
+            "validation",
+            MISSING,
+            "Train the model first",
+        ),
+        (lambda c, r: (c, replace(r, verdict=None, study_stopped=True)), "validation", READY, "was stopped"),
+        (lambda c, r: (replace(c, waiting="Being made."), r), "case", RUNNING, "Being made."),
+        (lambda c, r: (replace(c, waiting="Being made."), r), "poses", DONE, "drawn"),
     ],
 )
 def test_each_step_says_what_it_lacks(change, step, state, words):

@@ -9,6 +9,7 @@ from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.textures.library import list_textures, read_texture, shipped_textures_folder
 
 pytest.importorskip("skimage")
+from ExpectedAppearancesLib.textures import photograph as photographs
 from ExpectedAppearancesLib.textures import proposal
 
 
@@ -54,8 +55,25 @@ def test_shipped_textures_vessels_are_mostly_found():
     assert (found & known).sum() / found.sum() > 2 * known.mean()  # far better than chance
 
 
-def test_command_writes_the_label_map(tmp_path):
+def test_a_photograph_is_read_in_a_size_for_synthesis_and_kept_as_a_texture(tmp_path, capsys):
     image, *_ = photograph(120)
-    files.write_png(tmp_path / "Foto ü.png", image)
-    assert proposal.main([str(tmp_path / "Foto ü.png"), str(tmp_path / "labels.png")]) == 0
-    assert set(np.unique(files.read_label_map(tmp_path / "labels.png"))) <= {0, 1, 2}
+    path, textures = tmp_path / "Foto ü.png", tmp_path / "textures"
+    textures.mkdir()
+    files.write_png(path, np.kron(image, np.ones((10, 20, 1), np.uint8)))
+    assert photographs.main(["read", str(path), str(tmp_path)]) == 0
+    small, labels = (np.load(tmp_path / name) for name in (photographs.IMAGE, photographs.LABELS))
+    assert small.shape == (512, 1024, 3) and labels.shape == (512, 1024)
+    assert photographs.main(["keep", str(tmp_path), str(textures), "Foto"]) == 0
+    (name,) = list_textures(textures)
+    texture = read_texture(name, *list_textures(textures)[name])
+    np.testing.assert_array_equal(texture.labels, labels)
+    np.testing.assert_array_equal(texture.image, small)
+
+    np.save(tmp_path / photographs.LABELS, np.zeros((512, 1024), np.uint8))
+    assert photographs.main(["keep", str(tmp_path), str(textures), "bare"]) == 1
+    assert list(list_textures(textures)) == ["Foto"]
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  - ")]
+    assert len(said) == 2 and "px of vessels" in said[1]
+    path.write_text("no picture")
+    assert photographs.main(["read", str(path), str(textures)]) == 1
+    assert "Foto ü.png" in capsys.readouterr().out and not (textures / photographs.IMAGE).exists()

@@ -123,3 +123,12 @@ def test_the_library_is_found_whatever_the_path_was(monkeypatch):
     assert environment_of("m")["PYTHONPATH"].split(os.pathsep) == ["/slicer/a", "/slicer/b", str(LIBRARY_PARENT)]
     monkeypatch.delenv("PYTHONPATH")
     assert environment_of("m")["PYTHONPATH"] == str(LIBRARY_PARENT)
+
+
+def test_a_run_solves_small_systems_on_one_thread_unless_the_user_says_otherwise(monkeypatch):
+    from ExpectedAppearancesLib.runs.environment import library_environment
+
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    assert library_environment()["OPENBLAS_NUM_THREADS"] == "1"
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
+    assert library_environment()["OPENBLAS_NUM_THREADS"] == "3"

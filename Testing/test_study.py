@@ -243,11 +243,12 @@ def some_job(studied) -> study_folds.FoldJob:
 def test_a_stopped_fold_leaves_no_process_and_says_what_it_did(studied):
     (studied.trainer / "wait").write_text("quick-strict-a")
     job, heard = some_job(studied), []
+    title = "quick model without a, unseen poses"
     with pytest.raises(CancelledError):
         study_folds.train_fold(
-            job, lambda fraction, text: heard.append((fraction, text)), lambda: (0.6, "quick-strict-a: step 2") in heard
+            job, lambda fraction, text: heard.append((fraction, text)), lambda: (0.6, f"{title}: step 2") in heard
         )
-    assert (0.5, "quick-strict-a: step 1, loss 0.5") in heard
+    assert (0.5, f"{title}: step 1, loss 0.5") in heard
     assert not alive(int((studied.trainer / "pid").read_text())) and not study_folds.is_trained(job)
 
 

@@ -234,7 +234,7 @@ def test_training_is_on_record_with_seeds_styles_and_curve(trained):
 def test_a_stopped_training_goes_on_from_its_checkpoint(trained, monkeypatch):
     from ExpectedAppearancesLib.model import training
 
-    monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
+    monkeypatch.setattr(training, "checkpoint_interval_s", lambda _took_s: 0.0)
     preset = replace(TINY, steps=6)
     saves = []
     original = training._Trainer._save
@@ -254,6 +254,14 @@ def test_a_stopped_training_goes_on_from_its_checkpoint(trained, monkeypatch):
     assert threading.active_count() <= before + 1
 
 
+def test_saving_costs_a_hundredth_of_the_time_and_a_kill_loses_a_bounded_time():
+    from ExpectedAppearancesLib.model.training import checkpoint_interval_s
+
+    assert checkpoint_interval_s(0.0) == checkpoint_interval_s(0.05) == 10.0
+    assert checkpoint_interval_s(0.3) == pytest.approx(30.0)
+    assert checkpoint_interval_s(20.0) == 45.0  # on the slowest disk
+
+
 # A training that saves nothing on its own, and notes every step that it has done.
 STEPPER = """
 import sys
@@ -269,7 +277,7 @@ def noted(self, step):
         print(step + 1, file=stream)
 
 if __name__ == "__main__":
-    training.CHECKPOINT_EVERY_S = 1e9
+    training.checkpoint_interval_s = lambda took_s: 1e9
     training._Trainer._update_average = noted
     small = {"size_px": 64, "batch": 4, "fresh": 2, "validation_views": 6, "width": 0.4}
     presets.PRESETS["quick"] = replace(presets.PRESETS["quick"], steps=10**6, validate_every=10**6, **small)

@@ -49,7 +49,8 @@ class Chosen:
     given or wrong, then camera_problem says why. poses: {"poses", "seed", "ranges", "craniotomy"} as `render` records
     them, None where they cannot be had. textures: name -> SHA-256 of image and labels, "" while it has not been read.
     synthesis: {"size_px", "iterations"}. running: kinds of runs that go on. scan_unsaved: the chosen MRI is not in the
-    case, which changes nothing that is made from it.
+    case, which changes nothing that is made from it. waiting: what is still being worked out of the models, '' if
+    nothing is; what the case says of them is not known so long.
     """
 
     folder: str = ""
@@ -65,6 +66,7 @@ class Chosen:
     preset: str = ""
     running: frozenset[str] = frozenset()
     scan_unsaved: bool = False
+    waiting: str = ""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
         step = steps[name]
         if step.state is StepState.DONE and before and name not in ("microscope", "textures"):
             steps[name] = Step(StepState.STALE, f"Outdated: {names[before[0]]} changed, see above.")
-        if steps[name].state is not StepState.DONE and name in names:
+        if steps[name].state is not StepState.DONE and name in names and not (name == "case" and chosen.waiting):
             before.append(name)
     return steps
 
@@ -155,6 +157,8 @@ def changes_of_textures(chosen: dict[str, str], index: dict) -> list[str]:
 
 
 def _case(chosen: Chosen, recorded: Recorded) -> Step:
+    if chosen.waiting:
+        return Step(StepState.RUNNING, chosen.waiting)
     if not chosen.has_vessels and recorded.manifest is None:
         return Step(StepState.MISSING, "Choose the vessel model, or open a case.")
     if not chosen.folder:
@@ -275,7 +279,12 @@ def _validation(chosen: Chosen, recorded: Recorded) -> Step:
     if "study" in chosen.running:
         return Step(StepState.RUNNING, "A study is going on: for each texture a model is trained without it.")
     if recorded.verdict is None:
-        return Step(StepState.MISSING, "Train the model first." if recorded.model is None else "No figures yet.")
+        if recorded.study_stopped:
+            return Step(StepState.READY, "The study was stopped; it goes on where it was.")
+        if recorded.model is not None:
+            return Step(StepState.MISSING, "No figures yet.")
+        possible = recorded.index is not None and recorded.index["done"]
+        return Step(StepState.MISSING, "Train the model, or start a study." if possible else "Train the model first.")
     ready, reasons = recorded.verdict
     if recorded.validation == "stale":
         return Step(StepState.STALE, "The figures belong to an older model of this case.")

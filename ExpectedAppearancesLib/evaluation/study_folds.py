@@ -46,6 +46,14 @@ class FoldJob:
     def folder(self) -> Path:
         return Path(self.case_folder) / "study" / "folds" / self.name
 
+    @property
+    def title(self) -> str:
+        """Which model it is, for people."""
+        if self.protocol == "textures":
+            return f"{self.preset} model of {int(self.name.rpartition('-')[2])} textures"
+        poses = "seen" if self.protocol == "loto" else "unseen"
+        return f"{self.preset} model without {', '.join(self.exclude)}, {poses} poses"
+
     def arguments(self) -> list[str]:
         """Of the `train` command."""
         words = ["train", self.case_folder, "--model-folder", self.folder, "--preset", self.preset]
@@ -103,7 +111,7 @@ def train_fold(
                 shown += 1
                 match = _PROGRESS.match(line)
                 if match:
-                    progress(int(match[1]) / 100, f"{job.name}: {match[2]}")
+                    progress(int(match[1]) / 100, f"{job.title}: {match[2]}")
             time.sleep(0.2)
     finally:
         _end(process)

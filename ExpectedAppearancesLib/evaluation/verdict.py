@@ -73,7 +73,7 @@ def verdict(rows: list[Figures], limits: Limits) -> tuple[bool, tuple[str, ...]]
     row = next((of_all[name] for name in ("strict", OWN_VALIDATION, "loto") if name in of_all), None)
     if row is None:
         return None
-    accuracy_name = "ADD below 3 mm" if row.protocol == OWN_VALIDATION else "within 3 mm and 3°"
+    accuracy_name = "of views with ADD below 3 mm" if row.protocol == OWN_VALIDATION else "within 3 mm and 3°"
     reasons = []
     if row.add_mm_mean is None or row.add_mm_mean > limits.add_mm:
         reasons.append(f"mean ADD {_text(row.add_mm_mean, 'mm')}, limit {limits.add_mm:.1f} mm")

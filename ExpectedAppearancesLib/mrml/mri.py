@@ -6,6 +6,7 @@ It is only looked at: nothing that is made from the case depends on it.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -65,25 +66,35 @@ def keep_scan(case: Case, node, identity: dict | None = None) -> Path:
 
     The node itself stays as it is. Raises InputError where the disk is full or the node holds no image.
     """
-    identity = identity or scan_identity(node)
+    for _piece in keeping_scan(case, node, identity or scan_identity(node)):
+        pass
+    return case.folder / FILE_NAME
+
+
+def keeping_scan(case: Case, node, identity: dict) -> Iterator[None]:
+    """`keep_scan` a piece at each step. Closed before its end it leaves the case as it was."""
     path = case.folder / FILE_NAME
     files.require_space(case.folder, node.GetImageData().GetActualMemorySize() / 1024 + 5)
+    name = node.GetName()
+    source = node.GetStorageNode().GetFileName() if node.GetStorageNode() else None
     hardened = _hardened(node)
+    yield
     with files.replacing(path) as temporary:
         storage = _storage(hardened.GetScene(), temporary)
         storage.SetUseCompression(0)  # to write a scan takes tens of milliseconds, to compress it seconds
         if not storage.WriteData(hardened):
             raise InputError(f"{path}: the MRI cannot be written; free some space or choose another folder.")
-    # As it is read: readers may turn the order of the voxels.
-    read = hardened.GetScene().AddNewNodeByClass("vtkMRMLScalarVolumeNode")
-    if not _storage(hardened.GetScene(), path).ReadData(read):
-        raise InputError(f"{path}: the MRI cannot be kept with the case; save the case without one.")
-    kept = scan_identity(read)
-    source = node.GetStorageNode().GetFileName() if node.GetStorageNode() else None
-    entry = {"file": FILE_NAME, "name": node.GetName(), "source": source or None}
+        yield
+        # As it is read: readers may turn the order of the voxels.
+        read = hardened.GetScene().AddNewNodeByClass("vtkMRMLScalarVolumeNode")
+        if not _storage(hardened.GetScene(), temporary).ReadData(read):
+            raise InputError(f"{path}: the MRI cannot be kept with the case; save the case without one.")
+        kept = scan_identity(read)
+        yield
+    entry = {"file": FILE_NAME, "name": name, "source": source or None}
     case.attach(MRI, entry | {"identities": [identity] if _same(identity, kept) else [identity, kept]})
-    node.SetAttribute(ATTRIBUTE, kept["voxels_sha256"])
-    return path
+    if node.GetScene() is not None:
+        node.SetAttribute(ATTRIBUTE, kept["voxels_sha256"])
 
 
 def scan_of(scene, case: Case):

@@ -14,6 +14,7 @@ from ..geometry.pose import RAS_FROM_LPS, camera_to_ras, inverse, transform
 from ..masks.labels import CLASS_NAMES
 from ..poses.craniotomy import Craniotomy, find_craniotomy
 from .scene import camera_from_pixel
+from .segment_surface import no_surface
 
 FRUSTUMS, LOOKED_THROUGH, MASK = "Sampled cameras", "Camera looked through", "Label map seen"
 MASK_COLOURS = "Label map colours"
@@ -22,12 +23,17 @@ FRUSTUM_COLOUR, LOOKED_THROUGH_COLOUR = (0.20, 0.45, 0.75), (1.0, 0.82, 0.2)
 FRUSTUM_LENGTH = 0.18  # of the distance to the craniotomy: cameras stay recognisable and do not cover the cortex
 
 
-def world_mesh(node, segment_id: str = "", space: str = "LPS") -> Mesh:
+def world_mesh(node, segment_id: str = "", space: str = "LPS", surface: Mesh | None = None) -> Mesh:
     """Surface of a model node, or of one segment of a segmentation node, with all its transforms applied.
 
-    space: axes of the result, 'LPS' or 'RAS', mm. Raises InputError when there is no surface.
+    space: axes of the result, 'LPS' or 'RAS', mm. surface: that of the segment in the segmentation's own RAS, where it
+    was made before. Raises InputError when there is no surface.
     """
-    if node.IsA("vtkMRMLSegmentationNode"):
+    if surface is not None:
+        if node.GetParentTransformNode() is None:
+            return surface if space == "RAS" else _turned(surface)
+        polydata = surface.to_polydata(normals=False)
+    elif node.IsA("vtkMRMLSegmentationNode"):
         polydata = _segment_surface(node, segment_id)
     else:
         polydata = node.GetPolyData()
@@ -40,7 +46,12 @@ def world_mesh(node, segment_id: str = "", space: str = "LPS") -> Mesh:
         raise InputError(f"{node.GetName()}: {error}; make the model again.") from error
     if not len(mesh.triangles):
         raise InputError(f"{node.GetName()}: has no triangles; choose a surface, not points or centrelines.")
-    return mesh if space == "RAS" else Mesh(transform(RAS_FROM_LPS, mesh.vertices_mm), mesh.triangles)
+    return mesh if space == "RAS" else _turned(mesh)
+
+
+def _turned(mesh: Mesh) -> Mesh:
+    """From RAS to LPS or back."""
+    return Mesh(transform(RAS_FROM_LPS, mesh.vertices_mm), mesh.triangles)
 
 
 def same_mesh(first: Mesh, second: Mesh, tolerance_mm: float = 1e-3) -> bool:
@@ -65,9 +76,7 @@ def _segment_surface(node, segment_id: str):
     copy.CopySegmentFromSegmentation(segmentation, segment_id)
     name = slicer.vtkSegmentationConverter.GetSegmentationClosedSurfaceRepresentationName()
     if not copy.CreateRepresentation(name):
-        raise InputError(
-            f"{node.GetName()}: no surface could be made of this segment; draw the vessels, or choose another segment."
-        )
+        raise InputError(no_surface(node.GetName()))
     surface = vtk.vtkPolyData()
     surface.DeepCopy(copy.GetSegment(segment_id).GetRepresentation(name))
     return surface
@@ -160,17 +169,16 @@ def frustum_lengths_mm(poses: np.ndarray, centre_world_mm: np.ndarray) -> np.nda
 def line_model(scene, node, name: str, polydata, colour, width: float = 1.0):
     """Show `polydata` as the lines of `node`, which is made where it is None or was removed; returns the node."""
     if node is None or not scene.IsNodePresent(node):
-        node = scene.AddNewNodeByClass("vtkMRMLModelNode", name)
-        node.SetHideFromEditors(True)
-        node.SetSaveWithScene(False)
-        node.CreateDefaultDisplayNodes()
-        display = node.GetDisplayNode()
-        display.SetSaveWithScene(False)
+        node = _add_hidden(scene, "vtkMRMLModelNode", name)
+        node.SetAndObservePolyData(polydata)  # first: without lines there is nothing to draw, with them once
+        display = _new_display(node, "vtkMRMLModelDisplayNode")
         display.SetColor(*colour)
         display.SetLighting(False)
         display.SetLineWidth(width)
         display.SetVisibility2D(False)
-    node.SetAndObservePolyData(polydata)
+        node.SetAndObserveDisplayNodeID(scene.AddNode(display).GetID())
+    else:
+        node.SetAndObservePolyData(polydata)
     return node
 
 
@@ -189,20 +197,22 @@ def show_mask(scene, nodes: dict, labels: np.ndarray, camera: Camera, camera_fro
     if parent is None or not scene.IsNodePresent(parent):
         parent = nodes["transform"] = _add_hidden(scene, "vtkMRMLLinearTransformNode", LOOKED_THROUGH)
     parent.SetMatrixTransformToParent(_vtk_matrix(camera_to_ras(camera_from_world, space)))
-    volume = nodes.get("mask")
-    if volume is None or not scene.IsNodePresent(volume):
-        volume = nodes["mask"] = _add_hidden(scene, "vtkMRMLLabelMapVolumeNode", MASK)
-        volume.CreateDefaultDisplayNodes()
-        volume.GetDisplayNode().SetSaveWithScene(False)
-        volume.GetDisplayNode().SetAndObserveColorNodeID(_mask_colours(scene, nodes).GetID())
-        volume.SetAndObserveTransformNodeID(parent.GetID())
     data = vtkImageData()
     data.SetDimensions(labels.shape[1], labels.shape[0], 1)
     scalars = numpy_to_vtk(np.ascontiguousarray(labels, np.int16).ravel(), deep=True)
     scalars.SetName("ImageScalars")
     data.GetPointData().SetScalars(scalars)
+    volume = nodes.get("mask")
+    new = volume is None or not scene.IsNodePresent(volume)
+    if new:
+        volume = nodes["mask"] = _add_hidden(scene, "vtkMRMLLabelMapVolumeNode", MASK)
     volume.SetIJKToRASMatrix(_vtk_matrix(camera_from_pixel(camera, plane_mm)))
     volume.SetAndObserveImageData(data)
+    if new:
+        display = _new_display(volume, "vtkMRMLLabelMapVolumeDisplayNode")
+        display.SetAndObserveColorNodeID(_mask_colours(scene, nodes).GetID())
+        volume.SetAndObserveDisplayNodeID(scene.AddNode(display).GetID())
+        volume.SetAndObserveTransformNodeID(parent.GetID())
     return volume
 
 
@@ -258,6 +268,14 @@ def remove_nodes(scene, nodes: dict) -> None:
                 if display is not None and scene.IsNodePresent(display):
                     scene.RemoveNode(display)
     nodes.clear()
+
+
+def _new_display(node, kind: str):
+    """A display node that is not in the scene yet, so that it can be set up before anything is drawn."""
+    display = node.GetScene().CreateNodeByClass(kind)
+    display.UnRegister(None)
+    display.SetSaveWithScene(False)
+    return display
 
 
 def _mask_colours(scene, nodes: dict):

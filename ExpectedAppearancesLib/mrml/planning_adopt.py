@@ -3,34 +3,73 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Generator, Iterator
 
 from ..case.case import Case
 from ..case.steps import LENGTH_TOLERANCE_MM
 from ..errors import InputError
 from ..poses.sampling import PoseRanges
 from .mri import scan_of
+from .planning import remove_nodes
 from .planning_session import PlanningSession
-from .scene import CORTEX, VESSELS, add_case_models
+from .scene import CORTEX, VESSELS, add_case_model
 
 CASE_ATTRIBUTE = "ExpectedAppearances.CaseInput"
 
 
 def adopt(session: PlanningSession, parameters, scene) -> Case | None:
     """Take the case at parameters.casePath into scene and panel; None where there is none that can be opened."""
-    parameters.vesselsNode = parameters.cortexModel = None
-    case = session.case(parameters)
+    pieces = adopting(session, parameters, parameters.casePath, scene)
+    while True:
+        try:
+            next(pieces)
+        except StopIteration as stop:
+            return stop.value
+
+
+def adopting(session: PlanningSession, parameters, folder: str, scene) -> Generator[None, None, Case | None]:
+    """`adopt` of the case in `folder`, a piece at each step. Closed before its end it leaves nothing in the scene."""
+    case = session.reader.case(folder)[0]
+    yield
     if case is None:
+        with _at_once(parameters):
+            parameters.casePath = folder
+            parameters.vesselsNode = parameters.cortexModel = None
         return None
-    nodes = models_of(scene, case)
-    parameters.vesselsNode, parameters.cortexModel = nodes[VESSELS], nodes.get(CORTEX)
-    parameters.mriVolume = None
-    with contextlib.suppress(InputError):  # all else can be worked with; the panel says that the MRI is missing
-        parameters.mriVolume = scan_of(scene, case)
+    added: list = []
+    try:
+        for name in ("vessels", "cortex"):
+            getattr(case, name)  # read, and kept
+            yield
+        nodes = yield from _models(scene, case, added)
+        scan = None
+        with contextlib.suppress(InputError):  # all else can be worked with; the panel says that the MRI is missing
+            count = scene.GetNumberOfNodesByClass("vtkMRMLScalarVolumeNode")
+            scan = scan_of(scene, case)
+            added += [scan] if scene.GetNumberOfNodesByClass("vtkMRMLScalarVolumeNode") > count else []
+        yield
+        automatic = PoseRanges().resolved(case.camera, case.vessels.radius_mm)
+        yield
+    except GeneratorExit:
+        remove_nodes(scene, dict(enumerate(added)))
+        raise
+    with _at_once(parameters):
+        parameters.casePath = folder
+        parameters.vesselsNode, parameters.cortexModel = nodes[VESSELS], nodes.get(CORTEX)
+        parameters.mriVolume = scan
+        _adopt_settings(parameters, case, automatic)
+    yield from session.prepare(parameters)
+    if parameters.craniotomySource.value == "recorded" and session.is_fitted(parameters):
+        parameters.craniotomySource = type(parameters.craniotomySource)("fitted")
+    return case
+
+
+def _adopt_settings(parameters, case: Case, automatic: PoseRanges) -> None:
     parameters.cameraSource = type(parameters.cameraSource)("file")
     parameters.calibrationPath = str(case.folder / case.manifest["inputs"]["camera"]["file"])
     stages = case.manifest["stages"]
     if stages.get("render"):
-        _adopt_poses(session, parameters, case, stages["render"])
+        _adopt_poses(parameters, stages["render"], automatic)
     synthesize = stages.get("synthesize", {})
     if synthesize.get("method"):
         parameters.method = type(parameters.method)(synthesize["method"])
@@ -42,11 +81,10 @@ def adopt(session: PlanningSession, parameters, scene) -> Case | None:
         _take(parameters, "minutes", preset.get("minutes"))
     own_textures = case.folder / "textures"
     parameters.texturesPath = str(own_textures) if own_textures.is_dir() else parameters.texturesPath
-    return case
 
 
-def models_of(scene, case: Case) -> dict:
-    """The case's models in the scene, by name; added where they are not there yet."""
+def _models(scene, case: Case, added: list) -> Generator[None, None, dict]:
+    """The case's models in the scene, by name, a piece at each step; those that were not there are put into `added`."""
     found = {}
     for name, key in ((VESSELS, "vessels"), (CORTEX, "cortex")):
         entry = case.manifest["inputs"].get(key)
@@ -55,18 +93,15 @@ def models_of(scene, case: Case) -> dict:
             if entry and node.GetAttribute(CASE_ATTRIBUTE) == entry["sha256"]:
                 found[name] = node
         if entry and name not in found:
-            added = add_case_models(scene, case)
-            for kind, node in added.items():
-                node.SetAttribute(CASE_ATTRIBUTE, case.manifest["inputs"][kind.lower()]["sha256"])
-            for stale in found.values():
-                scene.RemoveNode(stale)
-            return added
+            found[name] = add_case_model(scene, case, name)
+            found[name].SetAttribute(CASE_ATTRIBUTE, entry["sha256"])
+            added.append(found[name])
+            yield
     return found
 
 
-def _adopt_poses(session: PlanningSession, parameters, case: Case, render: dict) -> None:
+def _adopt_poses(parameters, render: dict, automatic: PoseRanges) -> None:
     ranges = PoseRanges.from_dict(render["ranges"])
-    automatic = PoseRanges().resolved(case.camera, case.vessels.radius_mm)
     _take(parameters, "tiltMaxDeg", ranges.tilt_max_deg)
     _take(parameters, "rollMaxDeg", ranges.roll_max_deg)
     _take(parameters, "inViewPercent", 100 * ranges.in_view_min)
@@ -79,8 +114,19 @@ def _adopt_poses(session: PlanningSession, parameters, case: Case, render: dict)
     _take(parameters, "lateralMm", ranges.lateral_offset_mm)
     _take(parameters, "poseCount", render["poses"])
     parameters.seed = render["seed"]
-    source = "fitted" if session.is_fitted(parameters) else "recorded"
-    parameters.craniotomySource = type(parameters.craniotomySource)(source)
+    parameters.craniotomySource = type(parameters.craniotomySource)("recorded")
+
+
+@contextlib.contextmanager
+def _at_once(parameters) -> Iterator[None]:
+    """Within the block the parameters' node tells nobody that it changes, at its end once."""
+    node = getattr(parameters, "parameterNode", None)
+    modifying = node.StartModify() if node else 0
+    try:
+        yield
+    finally:
+        if node:
+            node.EndModify(modifying)
 
 
 def _take(parameters, name: str, value) -> None:

@@ -20,7 +20,9 @@ from ..poses.craniotomy import Craniotomy, find_craniotomy
 from ..poses.sampling import PoseRanges, PoseSampler
 from ..textures.library import list_textures, shipped_textures_folder
 from . import mri, planning
+from .segment_surface import SegmentSurfaces, voxels_version
 
+SURFACE_WAITING = "The surface of the segment is being made."
 MODELS = {"vessels": "vessel model", "cortex": "cortex model"}
 
 
@@ -34,7 +36,7 @@ class PlanningSession:
         self.reader = CaseReader()
         self.texture_digests: dict[tuple, str] = {}  # (name, version of its files) -> SHA-256, or "" without OpenCV
         self.texture_problems: dict[tuple, str] = {}
-        self.busy = False  # a run goes on: segments that are drawn on are looked at when it has ended
+        self.surfaces: SegmentSurfaces | None = None  # without them surfaces of segments are made at once
         self._kept: dict[str, tuple] = {}
 
     def case(self, parameters) -> Case | None:
@@ -53,13 +55,21 @@ class PlanningSession:
         segment_id = parameters.vesselsSegmentId if name == "vessels" else ""
         space = self.space(parameters)
         chosen = (node.GetID(), segment_id, space)
-        kept = self._kept.get(f"mesh.{name}")
-        if self.busy and node.IsA("vtkMRMLSegmentationNode") and kept and kept[0][:3] == chosen:
-            # To make a surface of a segment takes seconds, and a run that goes on does not use it.
-            version = kept[0]
-        else:
-            version = (*chosen, _version_of(node, segment_id))
-        return self._once(f"mesh.{name}", version, lambda: planning.world_mesh(node, segment_id, space))
+        if name == "vessels" and self.waiting(parameters):
+            kept = self._kept.get("mesh.vessels")
+            if kept and kept[0][:3] == chosen and kept[1] is not None:
+                return kept[1]  # as it was before it was drawn on
+            raise InputError(SURFACE_WAITING)
+        version = (*chosen, _version_of(node, segment_id))
+        made = self.surfaces.made if self.surfaces else (lambda *_segment: None)
+        return self._once(
+            f"mesh.{name}", version, lambda: planning.world_mesh(node, segment_id, space, made(node, segment_id))
+        )
+
+    def waiting(self, parameters) -> str:
+        """What is still being worked out of the chosen models, '' if nothing is."""
+        wanted = self.surfaces and self.surfaces.wanted(parameters.vesselsNode, parameters.vesselsSegmentId)
+        return SURFACE_WAITING if wanted else ""
 
     def camera(self, parameters) -> Camera:
         """From the calibration file or the field of view. Raises InputError."""
@@ -223,6 +233,7 @@ class PlanningSession:
             parameters.preset.value,
             running,
             self.scan_to_keep(parameters) is not None,
+            self.waiting(parameters),
         )
 
     def recorded(self, parameters) -> Recorded:
@@ -362,10 +373,7 @@ def _version_of(node, segment_id: str = "") -> tuple:
     parent = node.GetParentTransformNode()
     moved = parent.GetTransformToWorldMTime() if parent else 0
     if node.IsA("vtkMRMLSegmentationNode"):
-        segmentation = node.GetSegmentation()
-        segment = segmentation.GetSegment(segment_id) if segment_id else None
-        source = segment.GetRepresentation(segmentation.GetSourceRepresentationName()) if segment else None
-        return (source.GetMTime() if source else 0, moved)
+        return (voxels_version(node, segment_id), moved)
     if node.IsA("vtkMRMLModelNode"):
         return (node.GetPolyData().GetMTime() if node.GetPolyData() else 0, moved)
     raise ValueError(f"{node.GetClassName()}: neither model nor segmentation")

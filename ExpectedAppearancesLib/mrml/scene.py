@@ -82,15 +82,19 @@ def plane_depth_mm(vessels: Mesh, camera_from_world: np.ndarray) -> float:
 
 def add_case_models(scene, case: Case) -> dict:
     """Add the models 'Vessels' and, where the case has one, 'Cortex', in RAS mm; returns the nodes by name."""
+    names = (VESSELS, CORTEX) if case.cortex is not None else (VESSELS,)
+    return {name: add_case_model(scene, case, name) for name in names}
+
+
+def add_case_model(scene, case: Case, name: str):
+    """Add one of the case's models, VESSELS or CORTEX, in RAS mm; returns the node."""
+    mesh = case.vessels if name == VESSELS else case.cortex
     ras_from_world = RAS_FROM_LPS if case.space == "LPS" else np.eye(4)
-    nodes = {}
-    for name, mesh in ((VESSELS, case.vessels), (CORTEX, case.cortex)):
-        if mesh is not None:
-            in_ras = Mesh(transform(ras_from_world, mesh.vertices_mm), mesh.triangles)
-            nodes[name] = _add_model(scene, name, in_ras.to_polydata())
-    if CORTEX in nodes:
-        nodes[CORTEX].GetDisplayNode().SetOpacity(0.4)  # vessels below the surface stay visible
-    return nodes
+    in_ras = Mesh(transform(ras_from_world, mesh.vertices_mm), mesh.triangles)
+    node = _add_model(scene, name, in_ras.to_polydata())
+    if name == CORTEX:
+        node.GetDisplayNode().SetOpacity(0.4)  # vessels below the surface stay visible
+    return node
 
 
 def add_camera_transform(scene, camera_to_ras_matrix: np.ndarray):

@@ -1,17 +1,9 @@
-"""A first label map for a photograph of cortex, to be corrected by hand.
-
-In a process of its own (scikit-image takes a second to load):
-`python -m ExpectedAppearancesLib.textures.proposal PHOTOGRAPH LABELS.png`.
-"""
+"""A first label map for a photograph of cortex, to be corrected by hand."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 
-from .. import files
 from .library import BACKGROUND, PARENCHYMA, VESSELS
 
 WORKING_SIDE_PX = 512
@@ -76,13 +68,3 @@ def _eroded(mask: np.ndarray, by_px: int) -> np.ndarray:
     from scipy.ndimage import distance_transform_edt
 
     return mask if mask.all() else distance_transform_edt(mask) > by_px
-
-
-def main(argv: list[str]) -> int:
-    photograph, out = argv
-    files.write_png(Path(out), propose_labels(files.read_image_rgb(Path(photograph))))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

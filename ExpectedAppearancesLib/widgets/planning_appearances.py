@@ -42,7 +42,7 @@ class AppearancesSection(Section):
         for name in ("poses", "textures"):
             before = self.panel.steps[name]
             if before.state in (StepState.STALE, StepState.MISSING):
-                problem = problem or before.text
+                problem = problem or self.reason_of(name)
         problem = in_the_way(self.panel, "synthesize") or problem or self.panel.help.reason("training")
         index = self.panel.recorded.index
         self.controls.refresh(problem, unfinished=bool(index and not index["done"]), said=step.text)

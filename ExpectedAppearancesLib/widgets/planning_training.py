@@ -58,7 +58,7 @@ class TrainingSection(Section):
         problem = self.step.text if self.step.state is StepState.MISSING else ""
         before = self.panel.steps["appearances"]
         if before.state is not StepState.DONE:
-            problem = problem or before.text
+            problem = problem or self.reason_of("appearances")
         problem = in_the_way(self.panel, "train") or problem or self.panel.help.reason("training")
         self.controls.refresh(problem, unfinished=self._unfinished(), said=self.step.text)
         curve = self._curve(self.session.case(p))

@@ -49,7 +49,7 @@ class ValidationSection(Section):
         self._show_hint(len(textures))
         allow(
             self.ui.showFiguresButton,
-            "" if rows else _("Train the model first: there are no figures yet."),
+            "" if rows else _("There are no figures yet: train the model, or start a study."),
             _("Show the table of figures, and the plot of the mean ADD of each texture."),
         )
         if rows and rows != self._shown and charts.table_of(self.panel.scene):
@@ -88,7 +88,7 @@ class ValidationSection(Section):
         before = self.panel.steps["appearances"]
         problem = in_the_way(self.panel, "study")
         if not problem and before.state is not StepState.DONE:
-            problem = before.text
+            problem = self.reason_of("appearances")
         if not problem and textures < LEAST_TEXTURES:
             problem = _("A study leaves one texture out: make expected appearances of at least 2 textures.")
         return problem or self.panel.help.reason("training")
@@ -97,9 +97,9 @@ class ValidationSection(Section):
         """How much work it is."""
         p = self.parameters
         models = textures * len(p.studyProtocols.value.split(","))
-        text = _("Trains {models} models as set above, {minutes:g} min each at most: {hours:.1f} hours.").format(
-            models=models, minutes=p.minutes, hours=models * p.minutes / 60
-        )
+        text = _(
+            "Trains {models} models as set above: {time} of training, and some minutes more to test each of them."
+        ).format(models=models, time=_duration(models * p.minutes))
         set_text(self.ui.studyHint, text if models else "")
 
     def _fill(self, rows: list) -> tuple:
@@ -122,3 +122,9 @@ class ValidationSection(Section):
             _("Measured on: {protocol}.").format(protocol=_(PROTOCOL_NAMES.get(shown.protocol, shown.protocol)))
         )
         return "<br>".join(lines)
+
+
+def _duration(minutes: float) -> str:
+    if minutes < 90:
+        return _("{minutes:.0f} min").format(minutes=max(minutes, 1))
+    return _("{hours:.1f} hours").format(hours=minutes / 60)
