@@ -43,6 +43,7 @@ from .views import ViewSettings
 CHECKPOINT_EVERY_S, CHECKPOINT_AT_LEAST_EVERY_S = 10.0, 45.0
 CHECKPOINT_SHARE = 0.01  # of the time that a training may spend on saving itself
 CALIBRATION = 8  # times as many views as for validation: one wrong one in a hundred accepted is to be counted
+LEAST_CALIBRATION = 2  # where no more views were drawn in training
 LARGEST_COUNTED_ADD_MM = 20.0  # a lost view counts as this much, however far its pose is
 AVERAGE_DECAY = 0.995
 
@@ -96,7 +97,9 @@ def train_case(
     trainer.run(validation, progress)
     progress(1.0, "calibrating confidence")
     calibration_views = replace(validation_views, negatives=0.3, seed=seed + 2001)
-    calibration = draw_views(case.folder, calibration_views, CALIBRATION * preset.validation_views, workers)
+    drawn = trainer.state["drawn"] * preset.fresh
+    count = int(np.clip(drawn, *(times * preset.validation_views for times in (LEAST_CALIBRATION, CALIBRATION))))
+    calibration = draw_views(case.folder, calibration_views, count, workers)
     figures = trainer.export(calibration, validation, on_record)
     if fold is None:
         model_sha256 = files.sha256(case.model_folder / "model.onnx")
