@@ -39,7 +39,7 @@ def test_three_hundred_frames_each_with_its_own_pose_and_nothing_left_over(appli
     poses, images = frames
     view = SliceView(scene, logic, "Microscope", (320, 240))
     through = ThreeDView(scene, logic, "MicroscopeCamera", (160, 120))
-    views = LiveViews(view.node, view.composite, lambda: (through.node, through.camera_node, (160, 120)))
+    views = LiveViews(view.logic, lambda: (through.node, through.camera_node, (160, 120)))
     before = scene.GetNumberOfNodes()
     stream = node_with(scene, images[0])
     controller = LiveController(scene, views)

@@ -59,7 +59,7 @@ def measure(inputs_folder: Path | None = None) -> dict:
             frames = [painter.paint(pose) for pose in poses]
         scene, application = new_application()
         view = SliceView(scene, application, "Microscope", VIEW)
-        controller = LiveController(scene, LiveViews(view.node, view.composite, lambda: None))
+        controller = LiveController(scene, LiveViews(view.logic, lambda: None))
         measured, plain_ms = Measured(), []
         _run_live(controller, view, phantom, poses, frames, Measured())
         for _ in range(ROUNDS):
