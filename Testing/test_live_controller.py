@@ -159,6 +159,7 @@ def test_frames_are_registered_although_the_gui_holds_pythons_lock_between_ticks
     node_with(scene, frames[1][0])
     controller = LiveController(scene)
     controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: not controller.loading)
     holding = ctypes.PyDLL(None)  # unlike CDLL, it keeps the lock, as Slicer's event loop does
     shown = 0
     for number in range(400):

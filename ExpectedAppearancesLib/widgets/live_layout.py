@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import slicer
 
+from ..live.status import Status
 from ..mrml import live_views
 from ..mrml.live_banner import Banner
-from ..mrml.live_controller import Status
 from . import live_texts
 
 
