@@ -76,10 +76,12 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/live/estimator.py
   ExpectedAppearancesLib/live/feed.py
   ExpectedAppearancesLib/live/frames.py
+  ExpectedAppearancesLib/live/loading.py
   ExpectedAppearancesLib/live/overlay.py
   ExpectedAppearancesLib/live/recording.py
   ExpectedAppearancesLib/live/session.py
   ExpectedAppearancesLib/live/sources.py
+  ExpectedAppearancesLib/live/status.py
   ExpectedAppearancesLib/live/steady.py
   ExpectedAppearancesLib/live/trust.py
   ExpectedAppearancesLib/live/worker.py

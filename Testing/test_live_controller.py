@@ -39,7 +39,7 @@ def test_three_hundred_frames_each_with_its_own_pose_and_nothing_left_over(appli
     poses, images = frames
     view = SliceView(scene, logic, "Microscope", (320, 240))
     through = ThreeDView(scene, logic, "MicroscopeCamera", (160, 120))
-    views = LiveViews(view.node, view.composite, lambda: (through.node, through.camera_node, (160, 120)))
+    views = LiveViews(view.logic, lambda: (through.node, through.camera_node, (160, 120)))
     before = scene.GetNumberOfNodes()
     stream = node_with(scene, images[0])
     controller = LiveController(scene, views)
@@ -159,6 +159,7 @@ def test_frames_are_registered_although_the_gui_holds_pythons_lock_between_ticks
     node_with(scene, frames[1][0])
     controller = LiveController(scene)
     controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: not controller.loading)
     holding = ctypes.PyDLL(None)  # unlike CDLL, it keeps the lock, as Slicer's event loop does
     shown = 0
     for number in range(400):

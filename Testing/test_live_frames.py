@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ExpectedAppearancesLib.case.meshes import Mesh
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at, transform
@@ -103,8 +104,13 @@ def test_what_is_no_picture_is_said(image, words):
         FramePreparation(CAMERA).prepare(image)
 
 
-def test_fill_is_the_same_as_opencv_fills_triangle_by_triangle():
+@pytest.mark.parametrize("is_whole", [True, False], ids=["whole", "cut open"])
+def test_fill_is_the_same_as_opencv_fills_triangle_by_triangle(is_whole):
+    """Of vessels that are cut open towards the camera one sees the inner side."""
     mesh = cases.vessels()
+    if not is_whole:
+        middle_mm = mesh.vertices_mm[mesh.triangles].mean(axis=1)
+        mesh = Mesh(mesh.vertices_mm, mesh.triangles[(middle_mm[:, 0] < 5) | (_normals(mesh)[:, 2] < 0)])
     pose = POSE
     overlay = OverlayMaker(mesh).make(CAMERA, pose)
     pixels = CAMERA.project(transform(pose, mesh.vertices_mm))
@@ -115,6 +121,11 @@ def test_fill_is_the_same_as_opencv_fills_triangle_by_triangle():
     assert not (overlay.fill.astype(bool) & ~expected.astype(bool)).any()
     assert not (cv2.erode(expected, np.ones((3, 3))).astype(bool) & ~overlay.fill.astype(bool)).any()
     assert overlay.fill.sum() > 2000
+
+
+def _normals(mesh) -> np.ndarray:
+    a, b, c = mesh.vertices_mm[mesh.triangles].transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
 
 
 def test_winding_counts_overlaps_and_cuts_what_lies_outside():

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -58,3 +60,29 @@ def test_what_lies_behind_the_camera_is_left_out():
     points, lines = Silhouette(vertices, triangles).on_plane(behind, 50.0)
     assert points.shape == (0, 3)
     assert lines.shape == (0, 2)
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.8], ids=["closed", "with holes"])
+def test_boundary_goes_around_the_chosen_triangles_in_their_direction(kept):
+    vertices, triangles = sphere(12)
+    random = np.random.default_rng(1)
+    triangles = triangles[random.random(len(triangles)) < kept]
+    chosen = random.random(len(triangles)) < 0.5
+    expected = Counter()
+    for triangle in triangles[chosen].tolist():
+        for first, second in zip(triangle, triangle[1:] + triangle[:1]):
+            forwards = first < second
+            expected[(first, second) if forwards else (second, first)] += 1 if forwards else -1
+    silhouette = Silhouette(vertices, triangles)
+    assert silhouette.is_closed == (kept == 1.0)
+    edges, weight = silhouette.boundary(chosen)
+    assert dict(zip(map(tuple, edges.tolist()), weight.tolist())) == {e: w for e, w in expected.items() if w}
+
+
+def test_what_is_drawn_of_an_outline_has_its_own_numbers():
+    vertices, triangles = sphere(12)
+    silhouette = Silhouette(vertices, triangles)
+    edges = silhouette.edges(look_at(np.array([55.0, 20.0, -18.0]), CENTRE_MM, np.array([0.3, 1.0, 0.1])))
+    used, lines = silhouette.renumbered(edges)
+    np.testing.assert_array_equal(used[lines], edges)
+    assert sorted(set(edges.ravel().tolist())) == used.tolist()

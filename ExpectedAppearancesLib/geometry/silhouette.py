@@ -19,27 +19,44 @@ class Silhouette:
         self._middle_mm = self._vertices_mm.mean(axis=0) if len(self._vertices_mm) else np.zeros(3)
         self._face_normals = np.cross(b - a, c - a)
         self._face_offsets = np.einsum("ij,ij->i", self._face_normals, a - self._middle_mm)
-        edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-        count = len(self._vertices_mm)
-        keys, edge_of_side = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
+        starts, ends = triangles.T.ravel(), triangles[:, [1, 2, 0]].T.ravel()
+        count, low = len(self._vertices_mm), np.minimum(starts, ends).astype(np.int64)
+        keys, edge_of_side = np.unique(low * count + np.maximum(starts, ends), return_inverse=True)
         self._edges = np.stack([keys // count, keys % count], axis=1)
         self._sides = np.bincount(edge_of_side.ravel(), minlength=len(keys))
-        # The triangles at each edge, those of one edge behind one another.
-        self._triangles_at = np.argsort(edge_of_side.ravel(), kind="stable") % max(1, len(triangles))
+        # The triangles at each edge and the way they go along it, those of one edge behind one another.
+        order = np.argsort(edge_of_side.ravel(), kind="stable")
+        self._triangles_at = order % max(1, len(triangles))
+        self._sign_at = np.where(starts < ends, 1, -1).astype(np.int8)[order]
         self._first_at = np.cumsum(self._sides) - self._sides
+        self.is_closed = bool((self._sides == 2).all())
 
     def edges(self, camera_from_world: np.ndarray, facing_borders_only: bool = False) -> np.ndarray:
         """(E, 2) indices of the vertices of the outline's edges, from an OpenCV pose. Hidden outlines are included.
 
         facing_borders_only: leave out border edges of triangles that turn their back, which mostly hide behind others.
         """
-        return self._edges[self._is_outline(self._facing(camera_from_world), facing_borders_only)]
+        return self.edges_facing(self.towards(camera_from_world), facing_borders_only)
+
+    def edges_facing(self, towards: np.ndarray, facing_borders_only: bool = False) -> np.ndarray:
+        """As `edges`, from what `towards` said (F,)."""
+        facing = self._sum_at(towards[self._triangles_at])
+        return self._edges[self._is_outline(facing, facing_borders_only)]
+
+    def boundary(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The closed curves around the triangles chosen (F,): edges (E, 2) and how often each is gone along (E,).
+
+        Negative: from its second vertex to its first. Edges between two of the triangles cancel.
+        """
+        weight = self._sum_at(self._sign_at * chosen[self._triangles_at])
+        there = np.flatnonzero(weight)
+        return self._edges[there], weight[there]
 
     def edges_with_inside(self, camera_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `edges` with facing borders only, and for each edge (E,) the third vertex of a triangle at it that faces
         the camera: the side on which the surface is seen."""
-        towards_at = self._towards_at(camera_from_world)
-        chosen = np.flatnonzero(self._is_outline(self._count(towards_at), facing_borders_only=True))
+        towards_at = self.towards(camera_from_world)[self._triangles_at]
+        chosen = np.flatnonzero(self._is_outline(self._sum_at(towards_at), facing_borders_only=True))
         # At each edge the first of its triangles that faces the camera; only few edges have more than two.
         first, sides = self._first_at[chosen], self._sides[chosen]
         side, found = first.copy(), np.zeros(len(chosen), bool)
@@ -50,17 +67,13 @@ class Silhouette:
         edges = self._edges[chosen]
         return edges, self._triangles[self._triangles_at[side]].sum(axis=1) - edges.sum(axis=1)
 
-    def _facing(self, camera_from_world: np.ndarray) -> np.ndarray:
-        """Number of triangles at each edge that face the camera."""
-        return self._count(self._towards_at(camera_from_world))
-
-    def _count(self, towards_at: np.ndarray) -> np.ndarray:
-        if not len(self._edges):
-            return np.zeros(0, np.int32)
-        return np.add.reduceat(towards_at.astype(np.int32), self._first_at)
-
-    def _towards_at(self, camera_from_world: np.ndarray) -> np.ndarray:
-        return self.towards(camera_from_world)[self._triangles_at]
+    def _sum_at(self, values_at: np.ndarray) -> np.ndarray:
+        """Sum at each edge of small values (bool or int8) of the triangles there."""
+        if self.is_closed:
+            return values_at[0::2].view(np.int8) + values_at[1::2].view(np.int8)
+        running = np.zeros(len(values_at) + 1, np.int32)
+        np.cumsum(values_at, out=running[1:])
+        return running[self._first_at + self._sides] - running[self._first_at]
 
     def _is_outline(self, facing: np.ndarray, facing_borders_only: bool) -> np.ndarray:
         border = (self._sides == 1) & (facing >= (1 if facing_borders_only else 0))
@@ -80,6 +93,12 @@ class Silhouette:
         points_mm = self._vertices_mm @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         edges = self.edges(camera_from_world)
         edges = edges[(points_mm[edges, 2] > plane_depth_mm / 100).all(axis=1)]
-        used, lines = np.unique(edges, return_inverse=True)
+        used, lines = self.renumbered(edges)
         points_mm = points_mm[used]
-        return points_mm * (plane_depth_mm / points_mm[:, 2:3]), lines.reshape(-1, 2)
+        return points_mm * (plane_depth_mm / points_mm[:, 2:3]), lines
+
+    def renumbered(self, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The vertices that edges (E, 2) use, in their order, and the edges as indices of these."""
+        is_used = np.zeros(len(self._vertices_mm), bool)
+        is_used[edges] = True
+        return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[edges]

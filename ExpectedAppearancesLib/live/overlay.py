@@ -34,21 +34,11 @@ class Overlay:
 
 
 class OverlayMaker:
-    """Prepares one mesh once; makes overlays of it for any pose and camera. Not for two threads at once."""
+    """Prepares one mesh once; makes overlays of it for any pose and camera, also in two threads at once."""
 
     def __init__(self, vessels: Mesh):
         self._vessels = vessels
         self._silhouette = Silhouette(vessels.vertices_mm, vessels.triangles)
-        sides = np.concatenate([vessels.triangles[:, [i, (i + 1) % 3]] for i in range(3)])
-        self._edges, edge_of_side, count = np.unique(
-            np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
-        )
-        # Sides in the order of their edges: the triangle of each and its direction, and where each edge begins.
-        order = np.argsort(edge_of_side.ravel(), kind="stable")
-        self._triangle_of_side = order % max(1, len(vessels.triangles))
-        self._sign = np.where(sides[order, 0] < sides[order, 1], 1, -1).astype(np.int16)
-        self._first_side = np.cumsum(count) - count
-        self._is_closed = bool((count == 2).all())
         low, high = vessels.vertices_mm.min(axis=0), vessels.vertices_mm.max(axis=0)
         sides = list(itertools.product((0, 1), repeat=3))
         self._corners_mm = np.where(sides, high, low)
@@ -61,39 +51,39 @@ class OverlayMaker:
         depth_mm = float(np.median(points_mm[:, 2]))
         if depth_mm <= NEAREST_MM:
             return None
-        outline_mm, lines = self._silhouette.on_plane(pose, depth_mm)
+        towards = self._silhouette.towards(pose)
+        edges = self._silhouette.edges_facing(towards)
+        if points_mm[:, 2].min() <= depth_mm / 100:  # too near for a place in the picture
+            edges = edges[(points_mm[edges, 2] > depth_mm / 100).all(axis=1)]
+        used, lines = self._silhouette.renumbered(edges)
         corners_mm = transform(pose, self._corners_mm)
         has_box = corners_mm[:, 2].min() > NEAREST_MM
         return Overlay(
-            _pixels(camera, outline_mm),
+            _pixels(camera, points_mm[used]),
             lines,
-            self._fill(camera, pose, points_mm),
+            self._fill(camera, towards, points_mm),
             _pixels(camera, corners_mm) if has_box else np.zeros((0, 2)),
             self._sides if has_box else np.zeros((0, 2), np.int64),
             depth_mm,
         )
 
-    def _fill(self, camera: Camera, camera_from_world: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
+    def _fill(self, camera: Camera, towards: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
         shrink = min(1.0, LARGEST_FILL_PX / max(camera.width, camera.height))
         small = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
-        in_front = (points_mm[self._vessels.triangles, 2] > NEAREST_MM).all(axis=1)
-        near = points_mm.copy()
-        near[:, 2] = np.maximum(near[:, 2], NEAREST_MM)  # of triangles that are left out; a zero would warn
-        points_px = _pixels(small, near)
-        towards = self._silhouette.towards(camera_from_world)
-        seen = self._covered(points_px, towards & in_front, small)
-        if not (self._is_closed and in_front.all()):  # through holes one sees the other side
-            seen |= self._covered(points_px, ~towards & in_front, small)
-        return seen.astype(np.uint8)
+        if points_mm[:, 2].min() > NEAREST_MM:
+            seen = self._covered(points_mm, towards, small)
+            # Through holes one sees the other side.
+            return seen if self._silhouette.is_closed else seen | self._covered(points_mm, ~towards, small)
+        near = (points_mm[self._vessels.triangles, 2] <= NEAREST_MM).any(axis=1)
+        return self._covered(points_mm, towards & ~near, small) | self._covered(points_mm, ~towards & ~near, small)
 
-    def _covered(self, points_px: np.ndarray, used: np.ndarray, camera: Camera) -> np.ndarray:
-        """bool (H, W): whether a triangle of those used covers each pixel centre; all of them face the same way.
+    def _covered(self, points_mm: np.ndarray, used: np.ndarray, camera: Camera) -> np.ndarray:
+        """uint8 (H, W): 1 where a triangle of those used covers a pixel's centre; all of them face the same way.
 
         Edges between two of them cancel, so that only their common outline is drawn, as a winding number.
         """
-        weight = np.add.reduceat(self._sign * used[self._triangle_of_side], self._first_side)
-        chosen = np.nonzero(weight)[0]
-        return winding(points_px[self._edges[chosen]], weight[chosen], camera.width, camera.height) != 0
+        edges, weight = self._silhouette.boundary(used)
+        return (winding(_pixels(camera, points_mm[edges]), weight, camera.width, camera.height) != 0).view(np.uint8)
 
 
 def winding(edges_px: np.ndarray, weight: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -101,7 +91,6 @@ def winding(edges_px: np.ndarray, weight: np.ndarray, width: int, height: int) -
 
     weight (E,): how often each edge counts. What lies outside the frame is cut off, not drawn at its side.
     """
-    changes = np.zeros(height * (width + 1), np.int16)
     (x0, y0), (x1, y1) = edges_px[:, 0].T, edges_px[:, 1].T
     first = np.clip(np.ceil(np.minimum(y0, y1)), 0, height).astype(np.int64)
     rows = np.clip(np.ceil(np.maximum(y0, y1)), 0, height).astype(np.int64) - first
@@ -110,11 +99,14 @@ def winding(edges_px: np.ndarray, weight: np.ndarray, width: int, height: int) -
     slope = (x1 - x0)[which] / (y1 - y0)[which]
     column = np.clip(np.ceil(x0[which] + (row - y0[which]) * slope), 0, width).astype(np.int64)
     sign = (np.sign(y1 - y0)[which] * np.rint(weight)[which]).astype(np.int16)
-    np.add.at(changes, row * (width + 1) + column, sign)
-    # In one run over all rows: each row's changes cancel, since outlines are closed.
-    return np.cumsum(changes, dtype=np.int16).reshape(height, width + 1)[:, :-1]
+    # In one run over all rows, from crossing to crossing: each row's cancel, since outlines are closed.
+    place = row * (width + 1) + column
+    order = np.argsort(place)
+    count = np.concatenate([[0], np.cumsum(sign[order])]).astype(np.int16)
+    length = np.diff(place[order], prepend=0, append=height * (width + 1))
+    return np.repeat(count, length).reshape(height, width + 1)[:, :-1]
 
 
 def _pixels(camera: Camera, points_camera_mm: np.ndarray) -> np.ndarray:
     focal, centre = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    return points_camera_mm[:, :2] / points_camera_mm[:, 2:] * focal + centre
+    return points_camera_mm[..., :2] / points_camera_mm[..., 2:] * focal + centre

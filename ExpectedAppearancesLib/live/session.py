@@ -90,8 +90,9 @@ class Update:
 class LiveSession:
     """Registers frames of one case. Start it, feed it (`start`, or `push` for frames from the scene), tick it, stop it.
 
-    camera: of the frames as they come; the case's if None. stale_s: age from which a frame is not trusted. steady:
-    whether poses are filtered over time; not those of single steps, of files, and of models without covariance.
+    camera: of the frames as they come; the case's if None. stale_s: age from which a frame is not trusted. overlays:
+    of the case, where they were prepared before. steady: whether poses are filtered over time; not those of single
+    steps, of files, and of models without covariance.
     """
 
     def __init__(
@@ -102,13 +103,14 @@ class LiveSession:
         settings: FrameSettings | None = None,
         stale_s: float = 0.5,
         clock: Callable[[], float] = time.monotonic,
+        overlays: OverlayMaker | None = None,
     ):
         self.case_key = case_key(case)
         self.stale_s, self.steady = stale_s, False
         self._clock, self._estimator = clock, estimator
         self._steadying: Steadying | None = None
         self._preparation = FramePreparation(camera or case.camera, settings)
-        self._overlays = OverlayMaker(case.vessels)
+        self._overlays = overlays or OverlayMaker(case.vessels)
         self._worker: NewestWins[LiveFrame, LiveResult] = NewestWins(self._register)
         self._feed: Feed | None = None
         self._shown: LiveResult | None = None

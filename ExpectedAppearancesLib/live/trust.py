@@ -17,6 +17,7 @@ class Sight(Enum):
     """What the user is told, from nothing to trust."""
 
     IDLE = "idle"  # not started
+    LOADING = "loading"  # case and model are being read
     WAITING = "waiting"  # started, no frame yet
     LOST = "lost"  # the source vanished
     UNUSABLE = "unusable"  # the frame is no picture, or does not fit the camera

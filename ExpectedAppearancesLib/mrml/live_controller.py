@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -16,12 +15,14 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.pose import look_at
 from ..live.alignment import PoseDifference, compare, nudge_between, nudged
-from ..live.choice import Choice, SourceKind, open_source
-from ..live.estimator import OpenedModel, case_key, open_model
+from ..live.choice import Choice, SourceKind
+from ..live.estimator import OpenedModel, case_key
 from ..live.frames import LiveFrame
+from ..live.loading import Loaded, Loading, load
 from ..live.overlay import OverlayMaker
 from ..live.recording import RecordedFrame, add_truth
 from ..live.session import LiveResult, LiveSession, Update
+from ..live.status import IDLE, Status
 from ..live.steady import check_can_steady
 from ..live.trust import Sight, Verdict
 from ..poses.craniotomy import find_craniotomy
@@ -37,30 +38,6 @@ class Views(Protocol):
     """Whoever shows a LiveScene: told after each change, in the same call, so that nothing is drawn in between."""
 
     def follow(self, live: LiveScene, changed: bool) -> None: ...
-
-
-@dataclass(frozen=True)
-class Status:
-    """What the panel shows. result: of the frame on the screen. device: what the model runs on, '' without one."""
-
-    verdict: Verdict
-    result: LiveResult | None = None
-    dropped: int = 0
-    device: str = ""
-    new: bool = False
-
-    @property
-    def confidence(self) -> float | None:
-        """Of the pose on the screen; None where there is none, or where its file did not say."""
-        known = self.result is not None and self.result.prediction is not None
-        return self.result.prediction.confidence if known and np.isfinite(self.result.prediction.confidence) else None
-
-    @property
-    def latency_ms(self) -> float | None:
-        return None if self.result is None or self.result.image_rgb is None else self.result.latency_ms
-
-
-IDLE = Status(Verdict(Sight.IDLE))
 
 
 class LiveController:
@@ -82,6 +59,8 @@ class LiveController:
         self.status = IDLE
         self.shown_in_ms = 0.0  # how long the GUI thread was held to put the last frame into the scene
         self._session: LiveSession | None = None
+        self._loading: Loading | None = None
+        self._begin: Callable[[Loaded], None] | None = None  # what is to be done once that is through
         self._stream: NodeFrames | None = None
         self._model: OpenedModel | None = None
         self._registers = True
@@ -90,7 +69,12 @@ class LiveController:
 
     @property
     def running(self) -> bool:
-        return self._session is not None
+        """Whether a session goes on, or is being loaded."""
+        return self._session is not None or self.loading
+
+    @property
+    def loading(self) -> bool:
+        return self._loading is not None
 
     @property
     def frozen(self) -> bool:
@@ -108,14 +92,10 @@ class LiveController:
     # ------------------------------------------------------------------------------------------------------ session
     def open_case(self, folder: Path) -> Case:
         """Open a case and put its models into the scene, unless it is the one that is open. Raises InputError."""
-        if self.case is None or self.case.folder != Path(folder).absolute() or self.live is None:
+        if not self._is_open(folder):
             case = Case.open(folder)
             case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now
-            if self.live is not None:
-                self.close()
-            self.case, self._overlays = case, OverlayMaker(case.vessels)
-            self.live = LiveScene(self._scene, case)
-            self.live.set_options(self.options)
+            self._put_up(case, OverlayMaker(case.vessels))
         return self.case
 
     @at_once
@@ -132,23 +112,17 @@ class LiveController:
         return True
 
     def start(self, choice: Choice, single: bool = False, model: OpenedModel | None = None) -> None:
-        """Begin to register what was chosen. single: hold the first frame. Raises InputError with what is wrong."""
+        """Begin to register what was chosen; what must be read for that is read in a thread, while `tick` goes on.
+
+        single: hold the first frame. What is wrong with case, model or source is in the status once `loading` is over.
+        Raises InputError for a volume that is not in the scene.
+        """
         self.stop()
         self._replayed = None
-        opened = open_source(choice)
         node = self._node(choice) if choice.kind is SourceKind.NODE else None
-        case = self.open_case(choice.case_path)
-        if choice.needs_model:
-            self._model = model or open_model(case)
-        self._registers = choice.needs_model
-        estimator = self._model.estimator if choice.needs_model else None
-        if choice.steady:
-            check_can_steady(estimator, case.model_folder)
-        self._session = LiveSession(case, estimator, opened.camera, choice.frames, choice.stale_s, self._clock)
-        self._session.steady = choice.steady
-        self._session.start(opened.source, single or opened.still)
-        if node is not None:
-            self._stream = NodeFrames(self._scene, node, self._session.push, self._clock)
+        known = (self.case, self._overlays) if self._is_open(choice.case_path) else (None, None)
+        self._loading = Loading(lambda: load(choice, *known, model))
+        self._begin = lambda loaded: self._start_session(loaded, choice, single, node)
         self.tick()
 
     @at_once
@@ -160,7 +134,7 @@ class LiveController:
             self._stream.close()
         if self._session is not None:
             self._session.stop()
-        self._stream = self._session = None
+        self._stream = self._session = self._loading = self._begin = None
         self.truth = None
         self.status = IDLE
         if self.live is not None:
@@ -183,7 +157,7 @@ class LiveController:
         if self._session is not None:
             self._session.stop()
         self._stream = self._session = self.live = self.case = self.recorder = self.alignment = None
-        self._model = self._overlays = self._replayed = self.truth = None
+        self._model = self._overlays = self._replayed = self.truth = self._loading = self._begin = None
         self.status = IDLE
 
     def freeze(self) -> None:
@@ -233,6 +207,9 @@ class LiveController:
 
         wait_s: time to give to those threads; where the GUI holds Python's lock, they run in no other time.
         """
+        if self._loading is not None:
+            self._end_loading(wait_s)
+            return self.status
         if self._session is None:
             return self.status
         if self._stream is not None:
@@ -320,7 +297,7 @@ class LiveController:
     # ---------------------------------------------------------------------------------------------------- recording
     def start_recording(self, limit_mb: float = live_record.DEFAULT_LIMIT_MB) -> None:
         """Record from the next frame on. Raises InputError when no frame was shown yet."""
-        if self.live is None or self.live.frame is None or not self.running:
+        if self.live is None or self.live.frame is None or self._session is None:
             raise InputError("recording: start the session first.")
         self.recorder = live_record.Recorder(self.live, limit_mb)
 
@@ -358,6 +335,45 @@ class LiveController:
         return self.status
 
     # ----------------------------------------------------------------------------------------------------- internal
+    def _is_open(self, folder: Path) -> bool:
+        return self.case is not None and self.live is not None and self.case.folder == Path(folder).absolute()
+
+    def _put_up(self, case: Case, overlays: OverlayMaker) -> None:
+        """The nodes of a case, instead of those of the case before."""
+        if self.live is not None:
+            self.close()
+        self.case, self._overlays = case, overlays
+        self.live = LiveScene(self._scene, case)
+        self.live.set_options(self.options)
+
+    @at_once
+    def _end_loading(self, wait_s: float) -> None:
+        loading, begin = self._loading, self._begin
+        if not loading.done(wait_s):
+            self.status = Status(Verdict(Sight.LOADING))
+            return
+        self._loading = self._begin = None
+        self.status = Status(IDLE.verdict, problem=loading.problem)
+        if not loading.problem:
+            begin(loading.take())
+
+    def _start_session(self, loaded: Loaded, choice: Choice, single: bool, node) -> None:
+        if self.case is not loaded.case:
+            self._put_up(loaded.case, loaded.overlays)
+        self._registers = loaded.model is not None
+        if loaded.model is not None:
+            self._model = loaded.model
+        estimator = loaded.model.estimator if loaded.model else None
+        source = loaded.source
+        self._session = LiveSession(
+            self.case, estimator, source.camera, choice.frames, choice.stale_s, self._clock, self._overlays
+        )
+        self._session.steady = choice.steady
+        self._session.start(source.source, single or source.still)
+        if node is not None:
+            self._stream = NodeFrames(self._scene, node, self._session.push, self._clock)
+        self.tick()
+
     @at_once
     def _show(self, update: Update) -> None:
         changed = False

@@ -179,6 +179,7 @@ class LiveScene:
 
     def set_options(self, options: OverlayOptions) -> None:
         self.options = options
+        self._draw_lines_again()
         self.set_overlay_visible(self.overlay_visible)
 
     def show_backdrop(self, view_id: str) -> None:
@@ -274,6 +275,8 @@ class LiveScene:
 
     def _draw_lines(self, role: str, camera: Camera, points_px: np.ndarray, lines: np.ndarray) -> None:
         self._drawn[role] = (camera, points_px, lines)
+        if not {OUTLINE: self.options.outline, BOX: self.options.box}.get(role, True):
+            return
         plane = scenes.camera_from_pixel(camera, self.plane_mm)
         plane[:2, 3] += 0.5 * self._view_pixel_mm, -0.5 * self._view_pixel_mm
         points_mm = np.column_stack([points_px, np.zeros(len(points_px))]) @ plane[:3, :3].T + plane[:3, 3]

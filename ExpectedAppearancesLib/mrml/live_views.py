@@ -57,19 +57,19 @@ def layout_description(with_mri: bool) -> str:
 
 
 class LiveViews:
-    """The views of the live layout. through_view: gives view node, camera node and size (px) of the view through the
-    camera, or None while there is none; depth_node: gives the MRI's slice, or None. line_view_ids: of the views that
-    outlines are drawn in; () for all."""
+    """The views of the live layout. slice_logic: of the view that shows the frame. through_view: gives view node,
+    camera node and size (px) of the view through the camera, or None while there is none; depth_node: gives the MRI's
+    slice, or None. line_view_ids: of the views that outlines are drawn in; () for all."""
 
     def __init__(
         self,
-        slice_node,
-        composite_node,
+        slice_logic,
         through_view: Callable[[], tuple | None],
         depth_node: Callable[[], object | None] = lambda: None,
         line_view_ids: tuple[str, ...] = (),
     ):
-        self._slice, self._composite = slice_node, composite_node
+        self._slice, self._composite = slice_logic.GetSliceNode(), slice_logic.GetSliceCompositeNode()
+        self._intensity = UnusedIntensity(slice_logic)
         self._through_view, self._depth_node = through_view, depth_node
         self._line_view_ids = line_view_ids
         self._fitted: tuple | None = None
@@ -79,6 +79,7 @@ class LiveViews:
         """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
         size = self._slice.GetDimensions()[:2]
         camera_to_world = live.camera_to_world
+        sample_by_rows(self._slice)
         align_slice(self._slice, live.camera, camera_to_world, live.plane_mm)
         if changed or self._fitted != (size, live.camera):
             self._fitted = (size, live.camera)
@@ -86,6 +87,7 @@ class LiveViews:
         live.set_view_pixel(view_pixel_mm(self._slice))
         live.show_lines_in(self._line_view_ids)
         show_layers(self._composite, live.frame, live.fill, live.fill_opacity)
+        self._intensity.skip()
         visible = live.overlay_visible
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
@@ -104,8 +106,13 @@ class LiveViews:
             else:
                 look_away(camera_node)
 
+    def let_go(self) -> None:
+        """The view samples as Slicer does by itself; the layers stay."""
+        self._intensity.restore()
+
     def leave(self) -> None:
         """Nothing of the live frame stays in the views."""
+        self.let_go()
         self._slice.SetSliceVisible(False)
         for put in (self._composite.SetBackgroundVolumeID, self._composite.SetLabelVolumeID):
             put(None)
@@ -148,6 +155,65 @@ def view_pixel_mm(slice_node) -> float:
     return slice_node.GetFieldOfView()[0] / max(slice_node.GetDimensions()[0], 1)
 
 
+def sample_by_rows(slice_node) -> None:
+    """Let Slicer sample the frame row by row, which takes a third of the time and gives the same pixels.
+
+    VTK does so where the space between a slab's slices is 1, and Slicer asks for that space for a single slice too: it
+    is the slices' spacing by the oversampling. The spacing says only how far a scroll moves, and one slice has no next.
+    """
+    spacing_mm = slice_node.GetSlabReconstructionOversamplingFactor()
+    if slice_node.GetPrescribedSliceSpacing()[2] != spacing_mm:
+        slice_node.SetPrescribedSliceSpacing(1.0, 1.0, spacing_mm)
+    if slice_node.GetSliceSpacingMode() != slice_node.PrescribedSliceSpacingMode:
+        slice_node.SetSliceSpacingModeToPrescribed()
+
+
+class UnusedIntensity:
+    """Keeps one slice view from working out the intensity of every pixel of a colour image for a threshold that is off.
+
+    Slicer does so for each frame, by way of hue and saturation. Where its pipeline is another one, nothing changes.
+    """
+
+    def __init__(self, slice_logic):
+        self._logic = slice_logic
+        self._display = self._component = self._intensity = None
+
+    def skip(self) -> None:
+        """Call it for each frame: Slicer builds the pipeline anew with another volume."""
+        layer = self._logic.GetBackgroundLayer()
+        display = layer.GetVolumeDisplayNode() if layer is not None else None
+        if display is not self._display:
+            self._display = display
+            is_colour = display is not None and display.IsA("vtkMRMLVectorVolumeDisplayNode")
+            self._component = _component_for_alpha(display) if is_colour else None
+            self._intensity = self._component.GetInputConnection(0, 0) if self._component is not None else None
+        picture = display.GetInputImageDataConnection() if self._component is not None else None
+        if picture is None:
+            return
+        wanted = self._intensity if display.GetApplyThreshold() else picture
+        if self._component.GetInputConnection(0, 0) is not wanted:
+            self._component.SetInputConnection(wanted)
+
+    def restore(self) -> None:
+        if self._component is not None:
+            self._component.SetInputConnection(self._intensity)
+        self._display = self._component = self._intensity = None
+
+
+def _component_for_alpha(display):
+    """The filter that takes the intensity out of hue, saturation and intensity, or None.
+
+    At the end of Slicer's pipeline colours and alpha are joined, and alpha is made of the intensity.
+    """
+    producer, which = display.GetOutputImageDataConnection().GetProducer(), 1
+    while producer.GetNumberOfInputPorts() and producer.GetNumberOfInputConnections(0) > which:
+        above = producer.GetInputConnection(0, which).GetProducer()
+        if above.IsA("vtkImageRGBToHSI"):
+            return producer
+        producer, which = above, 0
+    return None
+
+
 def align_depth_slice(slice_node, camera_to_ras: np.ndarray, plane_mm: float) -> None:
     """Lay the slice along the optical axis: image right to the right, into the head downwards, centred on the frame."""
     slice_to_camera = np.eye(4)
@@ -157,7 +223,8 @@ def align_depth_slice(slice_node, camera_to_ras: np.ndarray, plane_mm: float) ->
 
 
 def show_layers(composite_node, frame, fill, fill_opacity: float) -> None:
-    """The frame as background, the filled vessels as label layer; sets only what changed."""
+    """The frame as background, the filled vessels as label layer if they are to be seen; sets only what changed."""
+    fill = fill if fill_opacity > 0 else None  # a layer that nobody sees is sampled all the same
     for get, put, node in (
         (composite_node.GetBackgroundVolumeID, composite_node.SetBackgroundVolumeID, frame),
         (composite_node.GetLabelVolumeID, composite_node.SetLabelVolumeID, fill),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import slicer
 
+from ..live.status import Status
 from ..mrml import live_views
 from ..mrml.live_banner import Banner
-from ..mrml.live_controller import Status
 from . import live_texts
 
 
@@ -41,13 +41,14 @@ class LayoutSection:
         overview, through = self._three_d(live_views.OVERVIEW), self._three_d(live_views.THROUGH)
         if widget is None or overview is None or through is None:
             return None
-        composite = widget.sliceLogic().GetSliceCompositeNode()
+        if self.views is not None:
+            self.views.let_go()
         shown_in = [view.mrmlViewNode() for view in (overview, through)]
         for node in shown_in:  # nothing but the patient and the picture
             node.SetBoxVisible(False)
             node.SetAxisLabelsVisible(False)
         ids = tuple(node.GetID() for node in (widget.mrmlSliceNode(), *shown_in))
-        self.views = live_views.LiveViews(widget.mrmlSliceNode(), composite, self._through, self._depth, ids)
+        self.views = live_views.LiveViews(widget.sliceLogic(), self._through, self._depth, ids)
         self._overview_fits = False
         self._restrict_slice(widget.mrmlSliceNode())
         if not self._banners:

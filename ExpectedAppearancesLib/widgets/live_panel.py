@@ -10,8 +10,9 @@ from slicer.i18n import tr as _
 
 from ..errors import ExpectedAppearancesError
 from ..geometry.camera import Camera
+from ..live.status import IDLE
 from ..live.trust import Controls, controls
-from ..mrml.live_controller import IDLE, LiveController
+from ..mrml.live_controller import LiveController
 from ..mrml.live_scene import OverlayOptions
 from ..mrml.mri import scan_to_show
 from . import live_install
@@ -39,6 +40,7 @@ class LivePanel:
         self._gui_tag = None
         self._message = ""
         self._problem = ""
+        self._starting = False
         self._missing = live_install.problem()
         self._ticks = 0
         self._buttons: tuple | None = None
@@ -154,21 +156,27 @@ class LivePanel:
             self.start()
 
     def start(self, single: bool = False) -> bool:
-        """Start what is chosen. False, and the reason in the panel, when it cannot be started."""
+        """Start what is chosen. False, and the reason in the panel, when it cannot be; also later, once it is read."""
         self.say("")
-        qt.QApplication.setOverrideCursor(qt.Qt.WaitCursor)
         try:
             self.controller.start(self.source.choice(), single)
         except ExpectedAppearancesError as error:
             self.say(str(error))
             return False
-        finally:
-            qt.QApplication.restoreOverrideCursor()
+        self._starting = True
         self._parameter_node.browser = None
-        self._show_scan()
         self.refresh()
         self.tick()
         return True
+
+    def _started(self, problem: str) -> None:
+        """What was chosen has been read, or could not be."""
+        self._starting = False
+        if problem:
+            self.say(problem)
+        elif self.controller.running:
+            self._show_scan()
+        self.refresh()
 
     def _show_scan(self) -> None:
         """The MRI that the case was planned on, unless another one is chosen."""
@@ -235,6 +243,8 @@ class LivePanel:
     def _show(self) -> Controls:
         """Bring views and sections up to date; returns what the user can do now."""
         status = self.controller.tick(WAIT_S)
+        if self._starting and not self.controller.loading:
+            self._started(status.problem)
         has_frame = status.result is not None and status.result.image_rgb is not None
         can = controls(
             not self._problem,

@@ -8,8 +8,9 @@ import slicer
 from slicer.i18n import tr as _
 
 from ..errors import InputError
+from ..live.status import Status
 from ..mrml import live_record
-from ..mrml.live_controller import LiveController, Status
+from ..mrml.live_controller import LiveController
 from .labels import set_text
 
 

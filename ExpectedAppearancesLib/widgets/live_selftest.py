@@ -66,6 +66,26 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
             test.assertEqual(slicer.app.layoutManager().layout, before)
 
 
+def may_be_stopped_while_it_loads(test) -> None:
+    if not registration_is_installed(test):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        phantom, widget = started(Path(folder))
+        controller = widget.panel.controller
+        test.assertTrue(controller.loading)  # Start has returned before the model is read
+        test.assertIs(controller.status.verdict.sight, Sight.LOADING)
+        widget.ui.startButton.click()
+        test.assertFalse(controller.running)
+        until(test, lambda: not threads())
+        pump(0.1)
+        test.assertFalse(controller.running)
+        (phantom.case.model_folder / "model.onnx").write_bytes(b"damaged")
+        widget.ui.startButton.click()
+        until(test, lambda: not controller.running)
+        pump(0.1)
+        test.assertIn("model", widget.ui.problemLabel.text)
+
+
 def scene_close_and_reload_in_mid_stream_leave_nothing(test) -> None:
     if not registration_is_installed(test):
         return
@@ -147,6 +167,7 @@ def aligns_by_hand(test) -> None:
 CASES = (
     says_what_is_missing,
     follows_frames_and_gives_the_layout_back,
+    may_be_stopped_while_it_loads,
     scene_close_and_reload_in_mid_stream_leave_nothing,
     records_and_replays,
     aligns_by_hand,

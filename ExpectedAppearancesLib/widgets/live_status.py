@@ -6,7 +6,7 @@ import time
 
 from slicer.i18n import tr as _
 
-from ..mrml.live_controller import Status
+from ..live.status import Status
 from . import live_texts
 from .labels import set_text
 

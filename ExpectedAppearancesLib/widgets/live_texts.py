@@ -7,8 +7,8 @@ import math
 
 from slicer.i18n import tr as _
 
+from ..live.status import Status
 from ..live.trust import Sight
-from ..mrml.live_controller import Status
 
 GREEN, AMBER, RED, GREY = (0.05, 0.50, 0.20), (0.72, 0.45, 0.0), (0.75, 0.08, 0.10), (0.35, 0.37, 0.40)
 COLOURS = dict.fromkeys(Sight, RED) | {
@@ -16,6 +16,7 @@ COLOURS = dict.fromkeys(Sight, RED) | {
     Sight.FOUND: GREEN,
     Sight.FROZEN: AMBER,
     Sight.IDLE: GREY,
+    Sight.LOADING: GREY,
     Sight.WAITING: GREY,
 }
 
@@ -25,6 +26,7 @@ COLOURS = dict.fromkeys(Sight, RED) | {
 def _headlines() -> dict[Sight, str]:
     return {
         Sight.IDLE: _("NOT LIVE"),
+        Sight.LOADING: _("LOADING THE CASE"),
         Sight.WAITING: _("WAITING FOR A PICTURE"),
         Sight.LOST: _("NO PICTURE: source lost"),
         Sight.UNUSABLE: _("NO OVERLAY: frame unusable"),
@@ -43,6 +45,7 @@ def _headlines() -> dict[Sight, str]:
 def _details() -> dict[Sight, str]:
     return {
         Sight.IDLE: _("Choose a case and a source, then press Start."),
+        Sight.LOADING: _("The case and its model are being read."),
         Sight.WAITING: _("Started; no frame has come yet."),
         Sight.LOST: _("The source gives no frames; it is tried again every second."),
         Sight.OTHER_CASE: _("These frames were registered to the vessels of another case. Open that case."),

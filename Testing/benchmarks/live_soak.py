@@ -44,10 +44,12 @@ def soak(frames: int, minutes: float | None = None, rate_hz: float = 0.0) -> dic
         scene, application = new_application()
         view = SliceView(scene, application, "Microscope", (160, 120))
         through = ThreeDView(scene, application, "MicroscopeCamera", (80, 60))
-        views = LiveViews(view.node, view.composite, lambda: (through.node, through.camera_node, (80, 60)))
+        views = LiveViews(view.logic, lambda: (through.node, through.camera_node, (80, 60)))
         controller = LiveController(scene, views)
         source = scene.AddNewNodeByClass("vtkMRMLVectorVolumeNode", "Stream")
         controller.start(Choice(folder + "/case", SourceKind.NODE, node_name=source.GetID(), stale_s=60))
+        while controller.loading:
+            controller.tick(0.05)
         memory_mb, nodes, wrong, shown, longest_ms = [], [], 0, 0, 0.0
         begin, cpu_s = time.monotonic(), time.process_time()
         number = 0

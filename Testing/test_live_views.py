@@ -1,0 +1,154 @@
+"""The microscope's view gets the pixels that Slicer by itself would draw, for less work."""
+
+from __future__ import annotations
+
+import cases
+import numpy as np
+import pytest
+
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.geometry.camera import Camera
+from ExpectedAppearancesLib.geometry.pose import look_at
+from ExpectedAppearancesLib.live.estimator import case_key
+from ExpectedAppearancesLib.live.frames import LiveFrame
+from ExpectedAppearancesLib.live.overlay import OverlayMaker
+from ExpectedAppearancesLib.live.session import LiveResult
+from ExpectedAppearancesLib.registration.predictor import Prediction
+
+slicer = pytest.importorskip("slicer")
+
+from mrml_views import SliceView, new_application  # noqa: E402
+
+from ExpectedAppearancesLib.mrml import live_views  # noqa: E402
+from ExpectedAppearancesLib.mrml.live_scene import LiveScene, OverlayOptions  # noqa: E402
+from ExpectedAppearancesLib.mrml.live_views import LiveViews  # noqa: E402
+
+CAMERA = Camera(480, 270, 1000.0, 1000.0, 250.0, 125.0)
+POSE = look_at(np.array([25.0, -18.0, 90.0]), np.array([1.0, 0.5, -2.0]), np.array([0.2, 1.0, 0.0]))
+SIZE = (320, 240)  # the frame falls between the view's pixels, and above and below it the view is empty
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("views")
+    paths = cases.write_inputs(folder)
+    return Case.create(folder / "case", paths["vessels.vtp"], paths["cortex.vtp"], CAMERA)
+
+
+def result_of(case, accepted=True, seed=0) -> LiveResult:
+    image = np.random.default_rng(seed).integers(0, 255, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
+    overlay = OverlayMaker(case.vessels).make(CAMERA, POSE) if accepted else None
+    prediction = Prediction(POSE, accepted, 0.9, 5.0)
+    return LiveResult(LiveFrame(image, 0.0, seed), case_key(case), image, CAMERA, prediction, overlay)
+
+
+@pytest.fixture
+def watched(case):
+    """The frame in the live panel's view, and in one that Slicer draws by itself."""
+    scene, logic = new_application()
+    ours, plain = SliceView(scene, logic, "Microscope", SIZE), SliceView(scene, logic, "Plain", SIZE)
+    live, views = LiveScene(scene, case), LiveViews(ours.logic, lambda: None)
+    live.show(result_of(case))
+
+    def layers() -> tuple[np.ndarray, np.ndarray]:
+        views.follow(live, True)
+        live_views.align_slice(plain.node, live.camera, live.camera_to_world, live.plane_mm)
+        live_views.fit_slice(plain.node, live.camera, live.plane_mm)
+        live_views.show_layers(plain.composite, live.frame, live.fill, live.fill_opacity)
+        return blended(ours), blended(plain)
+
+    return live, views, ours, layers
+
+
+def blended(view) -> np.ndarray:
+    """uint8 (H, W, 4) of the layers as the view draws them."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    producer = view.logic.GetImageDataConnection().GetProducer()
+    producer.Update()
+    return vtk_to_numpy(producer.GetOutput().GetPointData().GetScalars()).reshape(SIZE[1], SIZE[0], -1).copy()
+
+
+def filters_above(view) -> list[str]:
+    """Classes of all that works for the view's picture."""
+    found, todo = [], [view.logic.GetImageDataConnection().GetProducer()]
+    while todo:
+        producer = todo.pop()
+        found.append(producer.GetClassName())
+        for port in range(producer.GetNumberOfInputPorts()):
+            for i in range(producer.GetNumberOfInputConnections(port)):
+                todo.append(producer.GetInputConnection(port, i).GetProducer())
+    return found
+
+
+def test_the_same_pixels_without_the_work_that_nobody_sees(watched):
+    _live, _views, ours, layers = watched
+    mine, plain = layers()
+    assert plain.shape == mine.shape and len(np.unique(plain)) > 100
+    np.testing.assert_array_equal(mine, plain)
+    assert (plain[:20, :, 3] == 0).all()  # the empty part is transparent, as it is on the slice in 3D
+    assert ours.logic.GetBackgroundLayer().GetReslice().GetSlabSliceSpacingFraction() == 1.0
+    assert "vtkImageRGBToHSI" not in filters_above(ours)
+
+
+def test_a_threshold_that_the_user_sets_is_one_of_intensity_and_can_be_taken_off(watched):
+    live, views, ours, layers = watched
+    before = layers()[0]
+    display = live.frame.GetDisplayNode()
+    display.SetThreshold(100, 255)
+    display.SetApplyThreshold(True)
+    mine, plain = layers()
+    assert 0.05 < (plain != before).any(axis=2).mean() < 0.9
+    np.testing.assert_array_equal(mine, plain)
+    display.SetApplyThreshold(False)
+    mine, plain = layers()
+    np.testing.assert_array_equal(mine, before)
+    assert "vtkImageRGBToHSI" not in filters_above(ours)
+    views.leave()
+    again = LiveViews(ours.logic, lambda: None)
+    again.follow(live, True)
+    display.SetApplyThreshold(True)
+    again.follow(live, False)
+    assert "vtkImageRGBToHSI" in filters_above(ours)
+
+
+def test_a_colour_window_that_the_user_sets_is_applied(watched):
+    live, _views, _ours, layers = watched
+    before = layers()[0]
+    live.frame.GetDisplayNode().SetWindowLevelMinMax(60, 160)
+    mine, plain = layers()
+    assert (mine != before).any()
+    np.testing.assert_array_equal(mine, plain)
+
+
+def test_the_filled_vessels_are_a_layer_only_while_they_are_seen(case, watched):
+    live, views, ours, _layers = watched
+    views.follow(live, False)
+    assert ours.composite.GetLabelVolumeID() == live.fill.GetID()
+    live.show(result_of(case, accepted=False, seed=1))
+    views.follow(live, False)
+    assert ours.composite.GetLabelVolumeID() is None
+    live.show(result_of(case, seed=2))
+    views.follow(live, False)
+    assert ours.composite.GetLabelVolumeID() == live.fill.GetID()
+    live.set_options(OverlayOptions(fill=False))
+    views.follow(live, False)
+    assert ours.composite.GetLabelVolumeID() is None
+
+
+def test_lines_that_were_not_wanted_are_those_of_the_frame_when_they_are(case, watched):
+    """They are not worked out while they are hidden, so they must be when they are shown."""
+    live, _views, _ours, _layers = watched
+    live.set_options(OverlayOptions(outline=False, box=False))
+    shifted = result_of(case, seed=3)
+    shifted.overlay.box_px[:] += 7
+    shifted.overlay.outline_px[:] += 7
+    live.show(shifted)
+    live.set_options(OverlayOptions(outline=True, box=True))
+    for role, points_px in (("box", shifted.overlay.box_px), ("outline", shifted.overlay.outline_px)):
+        points = live.lines[role].GetPolyData()
+        assert points.GetNumberOfPoints() == len(points_px)
+        x_mm, y_mm, z_mm = points.GetPoint(0)
+        drawn_px = x_mm / z_mm * CAMERA.fx + CAMERA.cx, y_mm / z_mm * CAMERA.fy + CAMERA.cy
+        np.testing.assert_allclose(drawn_px, points_px[0], atol=1e-6)
+        assert live.lines[role].GetDisplayNode().GetVisibility()
