@@ -100,6 +100,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/model/losses.py
   ExpectedAppearancesLib/model/networks.py
   ExpectedAppearancesLib/model/presets.py
+  ExpectedAppearancesLib/model/starting.py
   ExpectedAppearancesLib/model/training.py
   ExpectedAppearancesLib/model/views.py
   ExpectedAppearancesLib/mrml/__init__.py
@@ -190,6 +191,7 @@ set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md
   ExpectedAppearancesLib/appearances/weights/vgg16_imagenet_to_conv5_1_fp16.safetensors
   ExpectedAppearancesLib/demo/phantom.onnx
+  ExpectedAppearancesLib/model/weights/generated_patient_fp16.safetensors
   ExpectedAppearancesLib/textures/generated/apricot.labels.png
   ExpectedAppearancesLib/textures/generated/apricot.png
   ExpectedAppearancesLib/textures/generated/blush.labels.png

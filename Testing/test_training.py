@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from cases import camera, write_inputs
+from safetensors.torch import load_file
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import projection, store
@@ -101,6 +102,24 @@ def test_views_show_at_each_cell_what_they_say(case, method, monkeypatch):
         agreeing.append(agreement(view))
     source.close()
     assert np.mean(agreeing) > 0.6  # vessels are about two cells wide: edges cost the rest
+
+
+def test_training_starts_at_the_shipped_weights_and_asks_for_them_when_it_goes_on(case, tmp_path, monkeypatch):
+    """Other weights at the start are another training: a checkpoint of the old one is not continued."""
+    from ExpectedAppearancesLib.model import starting, training
+
+    preset = replace(PRESETS["quick"], size_px=64)
+
+    def trainer():
+        encoding = fit_encoding(np.stack([np.eye(4)] * 3), case.vessels.centroid_mm, case.vessels.radius_mm)
+        return training._Trainer(case, preset, encoding, CPU, 0, settings("surface"), tmp_path)
+
+    first = trainer()
+    shipped = load_file(str(starting.SHIPPED))
+    for state in (first.network.state_dict(), first.average, first.best):
+        assert torch.equal(state["down2.0.0.weight"], shipped["down2.0.0.weight"].float())
+    monkeypatch.setattr(training, "load_start", lambda _network: False)
+    assert trainer().state["settings"] != first.state["settings"]
 
 
 def test_views_depend_only_on_seed_and_index_and_have_poses_of_their_own(case):

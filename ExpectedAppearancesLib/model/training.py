@@ -38,6 +38,7 @@ from .fold import Fold
 from .losses import dense_loss, regression_loss, segmentation_loss
 from .networks import build_network
 from .presets import PAPER_EPOCHS, Preset
+from .starting import SHIPPED, load_start
 from .views import ViewSettings
 
 CHECKPOINT_EVERY_S, CHECKPOINT_AT_LEAST_EVERY_S = 10.0, 45.0
@@ -95,10 +96,10 @@ def train_case(
     if fold is None:
         case.record("train", **on_record, done=False)
     trainer.run(validation, progress)
-    progress(1.0, "calibrating confidence")
-    calibration_views = replace(validation_views, negatives=0.3, seed=seed + 2001)
     drawn = trainer.state["drawn"] * preset.fresh
     count = int(np.clip(drawn, *(times * preset.validation_views for times in (LEAST_CALIBRATION, CALIBRATION))))
+    progress(1.0, f"calibrating confidence on {count} views")
+    calibration_views = replace(validation_views, negatives=0.3, seed=seed + 2001)
     calibration = draw_views(case.folder, calibration_views, count, workers)
     figures = trainer.export(calibration, validation, on_record)
     if fold is None:
@@ -138,6 +139,7 @@ class _Trainer:
         self.camera = network_camera(case.camera, preset.size_px)
         torch.manual_seed(seed)
         network = build_network(preset.estimator, preset.size_px, preset.width, preset.reads).to(device)
+        started = preset.estimator == "dense" and load_start(network)
         self.network = network.to(memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=preset.learning_rate, weight_decay=1e-4, fused=True
@@ -156,6 +158,7 @@ class _Trainer:
         )
         self.appearances_sha256 = files.sha256(folder_of(case, views.method) / "index.json")
         identity = f"{preset.to_dict()} {seed} {views} {self.appearances_sha256} {ranges}"
+        identity += files.sha256(SHIPPED) if started else ""
         self.state = {
             "settings": {"sha256": hashlib.sha256(identity.encode()).hexdigest()},
             "step": 0,
