@@ -61,27 +61,30 @@ class ContrastAligner:
         A far search strays where vessels are many and faint: it is made where a near one matched little, and what
         matches better goes on.
         """
-        half = _Picture.of(image_rgb, self.camera, 2)
-        found = self._descend(fit, fit.camera_from_world, half, NEAR_PX)
+        half, outline = _Picture.of(image_rgb, self.camera, 2), self._outline(fit)
+        found = self._descend(fit, fit.camera_from_world, outline, half, NEAR_PX)
         if found is None or found.matched < SURE:
-            far = self._descend(fit, fit.camera_from_world, half, FAR_PX)
-            far = far and self._descend(fit, far.fit.camera_from_world, half, NEAR_PX)
+            far = self._descend(fit, fit.camera_from_world, outline, half, FAR_PX)
+            far = far and self._descend(fit, far.fit.camera_from_world, self._outline(far.fit), half, NEAR_PX)
             if far and (found is None or far.matched > found.matched):
                 found = far
         if found is None:
             return Contrast(fit, 0.0, NEAR_PX, 0.0, 0.0)
         sharp = _Picture.of(image_rgb, self.camera, 1)
-        return self._descend(fit, found.fit.camera_from_world, sharp, NEAR_PX) or found
+        return self._descend(fit, found.fit.camera_from_world, self._outline(found.fit), sharp, NEAR_PX) or found
 
-    def _descend(self, fit: PoseFit, start: np.ndarray, picture: _Picture, reach_px: float) -> Contrast | None:
-        edges, inner = self._silhouette.edges_with_inside(start)
+    def _outline(self, fit: PoseFit) -> np.ndarray:
+        """(3, 3 E): of E edges of the outline their beginnings, ends, and a vertex within; mm from the fit's centre."""
+        edges, inner = self._silhouette.edges_with_inside(fit.camera_from_world)
         every = len(edges) // POINTS + 1
-        centre = fit.centre_world_mm
-        # The outline's edges from a to b, a vertex within, and the edges' middles; rows of coordinates.
         corners = np.concatenate([edges[::every, 0], edges[::every, 1], inner[::every]])
-        corners = np.ascontiguousarray((self._vertices_mm[corners] - centre).T)
-        count = len(edges[::every])
-        relative = (corners[:, :count] + corners[:, count : 2 * count]) / 2
+        return np.ascontiguousarray((self._vertices_mm[corners] - fit.centre_world_mm).T)
+
+    def _descend(
+        self, fit: PoseFit, start: np.ndarray, corners: np.ndarray, picture: _Picture, reach_px: float
+    ) -> Contrast | None:
+        count = corners.shape[1] // 3
+        relative = (corners[:, :count] + corners[:, count : 2 * count]) / 2  # the edges' middles
         descent = Descent(fit, start, PRIOR)
         camera, search = picture.camera, None
         focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
