@@ -125,9 +125,10 @@ def test_descriptions_agree_with_the_modules(module):
     assert "Not for clinical use" in source or "not for clinical use" in source.lower()
 
 
-def test_icon_url_names_a_file_of_the_repository():
-    path = cmake_entries()["iconurl"].split("/main/")[1]
-    assert (ROOT / path).read_bytes().startswith(b"\x89PNG")
+@pytest.mark.parametrize(("entry", "begins"), [("iconurl", b"\x89PNG"), ("screenshoturls", b"\xff\xd8")])
+def test_picture_urls_name_files_of_the_repository(entry, begins):
+    for url in cmake_entries()[entry].split():
+        assert (ROOT / url.split("/main/")[1]).read_bytes().startswith(begins)
 
 
 @every_module
