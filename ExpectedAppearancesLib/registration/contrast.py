@@ -15,7 +15,7 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.silhouette import Silhouette
-from .descent import Descent
+from .descent import Descent, turn_and_place
 from .pnp import PoseFit, projection_jacobian
 
 SHARPER = 2  # frames are looked at in so many times the size that the network reads
@@ -62,40 +62,38 @@ class ContrastAligner:
         matches better goes on.
         """
         half, outline = _Picture.of(image_rgb, self.camera, 2), self._outline(fit)
-        found = self._descend(fit, fit.camera_from_world, outline, half, NEAR_PX)
+        search = _EdgeSearch.for_colours(half, outline)
+        found = search and self._descend(fit, outline, search, NEAR_PX)
         if found is None or found.matched < SURE:
-            far = self._descend(fit, fit.camera_from_world, outline, half, FAR_PX)
-            far = far and self._descend(fit, far.fit.camera_from_world, self._outline(far.fit), half, NEAR_PX)
+            far = search and self._descend(fit, outline, search, FAR_PX)
+            far = far and self._go_on(fit, far, half)
             if far and (found is None or far.matched > found.matched):
                 found = far
         if found is None:
             return Contrast(fit, 0.0, NEAR_PX, 0.0, 0.0)
-        sharp = _Picture.of(image_rgb, self.camera, 1)
-        return self._descend(fit, found.fit.camera_from_world, self._outline(found.fit), sharp, NEAR_PX) or found
+        return self._go_on(fit, found, _Picture.of(image_rgb, self.camera, 1)) or found
 
-    def _outline(self, fit: PoseFit) -> np.ndarray:
-        """(3, 3 E): of E edges of the outline their beginnings, ends, and a vertex within; mm from the fit's centre."""
+    def _go_on(self, fit: PoseFit, found: Contrast, picture: _Picture) -> Contrast | None:
+        """A near search from where another one ended."""
+        outline = self._outline(found.fit)
+        search = _EdgeSearch.for_colours(picture, outline)
+        return search and self._descend(fit, outline, search, NEAR_PX)
+
+    def _outline(self, fit: PoseFit) -> _Outline:
         edges, inner = self._silhouette.edges_with_inside(fit.camera_from_world)
         every = len(edges) // POINTS + 1
         corners = np.concatenate([edges[::every, 0], edges[::every, 1], inner[::every]])
-        return np.ascontiguousarray((self._vertices_mm[corners] - fit.centre_world_mm).T)
+        corners = np.ascontiguousarray((self._vertices_mm[corners] - fit.centre_world_mm).T)
+        return _Outline(fit, corners)
 
-    def _descend(
-        self, fit: PoseFit, start: np.ndarray, corners: np.ndarray, picture: _Picture, reach_px: float
-    ) -> Contrast | None:
-        count = corners.shape[1] // 3
-        relative = (corners[:, :count] + corners[:, count : 2 * count]) / 2  # the edges' middles
-        descent = Descent(fit, start, PRIOR)
-        camera, search = picture.camera, None
-        focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    def _descend(self, fit: PoseFit, outline: _Outline, search: _EdgeSearch, reach_px: float) -> Contrast | None:
+        descent = Descent(fit, outline.fit, PRIOR)
+        relative = outline.middles
+        focal = np.array([search.camera.fx, search.camera.fy])
         for _ in range(STEPS):
-            seen = descent.rotation @ corners + descent.position[:, None]
-            pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
-            a, b, within = (pixels[:, i * count : (i + 1) * count] for i in range(3))
-            points, normals = (a + b) / 2, _outward(a, b, within)
-            search = search or _EdgeSearch.for_colours(picture, points, normals, reach_px)
-            found = search and search.edges(points, normals)
-            if not found:
+            points, normals = outline.seen(descent.rotation, descent.position, search.camera)
+            found = search.edges(points, normals, reach_px)
+            if found is None:
                 return None
             offsets_px, weight, tissue = found
             turned = descent.rotation @ relative
@@ -114,6 +112,29 @@ class ContrastAligner:
             search.separation,
             descent.moved_mm(self._radius_mm),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Outline:
+    """The outline as seen from the pose of `fit`. corners_mm (3, 3 E): of its E edges the beginnings, the ends, and a
+    vertex within; from the fit's centre."""
+
+    fit: PoseFit
+    corners_mm: np.ndarray
+
+    @property
+    def middles(self) -> np.ndarray:
+        """Of the edges, (3, E)."""
+        count = self.corners_mm.shape[1] // 3
+        return (self.corners_mm[:, :count] + self.corners_mm[:, count : 2 * count]) / 2
+
+    def seen(self, rotation: np.ndarray, position: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """The edges' middles and outward normals in the image (2, E), from a pose given as `Descent` has it."""
+        seen = rotation @ self.corners_mm + position[:, None]
+        focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+        pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
+        a, b, within = np.split(pixels, 3, axis=1)
+        return (a + b) / 2, _outward(a, b, within)
 
 
 def _outward(a_px: np.ndarray, b_px: np.ndarray, within_px: np.ndarray) -> np.ndarray:
@@ -149,17 +170,15 @@ class _Picture:
 class _EdgeSearch:
     """Looks along normals for the vessels' edges in values (H, W), the picture on the colour axis of this frame."""
 
+    camera: Camera
     values: np.ndarray
     dark: np.ndarray
     separation: float
-    offsets_px: np.ndarray
-    reach_px: float
 
     @staticmethod
-    def for_colours(
-        picture: _Picture, points_px: np.ndarray, normals: np.ndarray, reach_px: float
-    ) -> _EdgeSearch | None:
-        """The axis on which colours beside the outline's points (2, E) differ most; None where too little is tissue."""
+    def for_colours(picture: _Picture, outline: _Outline) -> _EdgeSearch | None:
+        """The axis on which colours beside the outline differ most; None where too little of it lies on tissue."""
+        points_px, normals = outline.seen(*turn_and_place(outline.fit), picture.camera)
         beside = np.arange(NEAREST_PX, FARTHEST_PX + STEP_PX / 2, STEP_PX)
         where = _along(points_px, normals, np.concatenate([-beside, beside]))
         colours = cv2.remap(picture.image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -173,33 +192,35 @@ class _EdgeSearch:
         apart = across - mean
         axis = np.linalg.solve(apart.T @ apart / (len(across) - 1) + 4 * np.eye(3), mean)
         values = cv2.transform(picture.image, axis[None].astype(np.float32))
-        offsets_px = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
-        return _EdgeSearch(values, picture.dark, float(np.sqrt(max(mean @ axis, 0.0))), offsets_px, reach_px)
+        return _EdgeSearch(picture.camera, values, picture.dark, float(np.sqrt(max(mean @ axis, 0.0))))
 
-    def edges(self, points_px: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, int] | None:
+    def edges(
+        self, points_px: np.ndarray, normals: np.ndarray, reach_px: float
+    ) -> tuple[np.ndarray, np.ndarray, int] | None:
         """Offset of the step along each normal that is most like the expected one, px (E,), its weight (E,), and how
         many points lie on tissue; None when these are too few."""
-        where = _along(points_px, normals, self.offsets_px)
+        samples_px = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
+        where = _along(points_px, normals, samples_px)
         on_tissue = _on_tissue(self.dark, where)
         tissue = int(on_tissue.sum())
         if tissue < LEAST_POINTS:
             return None
         values = cv2.remap(self.values, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        middle, nearest, farthest = len(self.offsets_px) // 2, round(NEAREST_PX / STEP_PX), round(FARTHEST_PX / STEP_PX)
+        middle, nearest, farthest = len(samples_px) // 2, round(NEAREST_PX / STEP_PX), round(FARTHEST_PX / STEP_PX)
         inside = values[:, middle - farthest : middle - nearest + 1].mean(axis=1)
         outside = values[:, middle + nearest : middle + farthest + 1].mean(axis=1)
         expected = max(float((inside - outside) @ on_tissue) / tissue, 1e-9)
         window = round(WINDOW_PX / STEP_PX)
         # Column i: the sum of the `window` samples from the i-th on.
         sums = cv2.boxFilter(values, -1, (window, 1), anchor=(0, 0), normalize=False)[:, : 1 - window]
-        at = np.arange(window, len(self.offsets_px) - window)
+        at = np.arange(window, len(samples_px) - window)
         response = (sums[:, : len(at)] - sums[:, window + 1 :]) / (window * expected)
         best, rows = np.clip(response.argmax(axis=1), 1, len(at) - 2), np.arange(len(response))
         before, peak, after = (response[rows, best + i] for i in (-1, 0, 1))
         bend = before - 2 * peak + after
         between = np.where(bend < -1e-9, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
-        offsets_px = self.offsets_px[at[best]] + STEP_PX * np.clip(between, -1, 1)
-        last = self.reach_px - WINDOW_PX + STEP_PX
+        offsets_px = samples_px[at[best]] + STEP_PX * np.clip(between, -1, 1)
+        last = reach_px - WINDOW_PX + STEP_PX
         near = np.clip(1 - (offsets_px / last) ** 2, 0, 1) ** 2
         is_peak = (peak >= before) & (peak >= after)
         return offsets_px, np.clip(peak, 0, 1.5) * near * is_peak * on_tissue, tissue

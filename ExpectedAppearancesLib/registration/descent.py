@@ -11,15 +11,15 @@ from .pnp import STILL_MM, STILL_RAD, PoseFit
 
 
 class Descent:
-    """rotation (3, 3) and position (3,), mm, of the fit's centre in the camera frame, from the pose `start` on.
+    """rotation (3, 3) and position (3,), mm, of the fit's centre in the camera frame, from the pose of `start` on.
 
     prior_scale: the fit's covariance is taken this many times.
     """
 
-    def __init__(self, fit: PoseFit, start: np.ndarray, prior_scale: float):
+    def __init__(self, fit: PoseFit, start: PoseFit, prior_scale: float):
         self._fit = fit
-        self._first, self._origin = _turn_and_place(fit.camera_from_world, fit.centre_world_mm)
-        self.rotation, self.position = _turn_and_place(start, fit.centre_world_mm)
+        self._first, self._origin = turn_and_place(fit)
+        self.rotation, self.position = turn_and_place(start)
         self._prior = self._information = np.linalg.inv(fit.covariance * prior_scale)
 
     def step(self, gradient: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> bool:
@@ -46,6 +46,7 @@ class Descent:
         return float(np.hypot(np.linalg.norm(self.position - self._origin), turned_rad * radius_mm * np.sqrt(2 / 3)))
 
 
-def _turn_and_place(camera_from_world: np.ndarray, centre_world_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    rotation = camera_from_world[:3, :3]
-    return rotation, rotation @ centre_world_mm + camera_from_world[:3, 3]
+def turn_and_place(fit: PoseFit) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and position (3,), mm, of the fit's centre in the camera frame."""
+    rotation = fit.camera_from_world[:3, :3]
+    return rotation, rotation @ fit.centre_world_mm + fit.camera_from_world[:3, 3]

@@ -55,7 +55,7 @@ class VesselAligner:
         edges = self._silhouette.edges(fit.camera_from_world, facing_borders_only=True)
         edges = edges[:: len(edges) // POINTS + 1]
         relative = np.ascontiguousarray((self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm).T)
-        descent = Descent(fit, fit.camera_from_world, PRIOR)
+        descent = Descent(fit, fit, PRIOR)
         for _ in range(ITERATIONS):
             turned = descent.rotation @ relative
             seen = turned + descent.position[:, None]
