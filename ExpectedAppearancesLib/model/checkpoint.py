@@ -10,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from .. import files
+from ..errors import InputError
 
 NAME = "checkpoint.safetensors"
 
@@ -58,3 +59,14 @@ def load(folder: Path, network, optimizer, settings: dict) -> tuple[dict, dict, 
     device = next(network.parameters()).device
     on_device = ({k: v.to(device) for k, v in parts[part].items()} for part in ("average", "best"))
     return *on_device, state
+
+
+def best_weights(folder: Path) -> dict[str, torch.Tensor]:
+    """The best average of a training so far. Raises InputError where there is none."""
+    path = folder / NAME
+    try:
+        with safe_open(str(path), framework="pt") as stream:
+            names = [key for key in stream.keys() if key.startswith("best.")]  # noqa: SIM118 (not a dict)
+            return {name.partition(".")[2]: stream.get_tensor(name) for name in names}
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path}: no saved training ({error}); give the model folder of a trained case.") from error

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
@@ -41,11 +41,7 @@ def load_start(network: nn.Module) -> bool:
 
 def write_start(model_folder: Path, path: Path = SHIPPED) -> None:
     """Write the best weights of the training in `model_folder`, in half precision. Raises InputError without them."""
-    saved = Path(model_folder) / checkpoint.NAME
-    if not saved.is_file():
-        raise InputError(f"{saved}: not there; give the model folder of a case that was trained.")
-    with safe_open(str(saved), framework="pt") as stream:
-        best = {k[len("best.") :]: stream.get_tensor(k) for k in stream.keys() if k.startswith("best.")}  # noqa: SIM118
+    best = checkpoint.best_weights(Path(model_folder))
     tensors = {
         name: (tensor.half() if tensor.is_floating_point() else torch.zeros_like(tensor)).contiguous()
         for name, tensor in best.items()

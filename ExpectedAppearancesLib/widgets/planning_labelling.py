@@ -12,10 +12,10 @@ from slicer.i18n import tr as _
 from ..masks.labels import PARENCHYMA
 from ..mrml import labelling
 from ..mrml.planning import remove_nodes
+from ..textures.photograph import IMAGE, LABELS
 from .planning_qt import Child, allow, library_command, problems_in
 
 PHOTOGRAPH_MODULE = "ExpectedAppearancesLib.textures.photograph"
-IMAGE, LABELS = "photograph.npy", "labels.npy"  # as that module calls them, which loads what reads pictures
 
 
 class Labelling:
