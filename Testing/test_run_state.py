@@ -29,7 +29,7 @@ from ExpectedAppearancesLib.runs.state import RunState, controls
         (RunState.FAILED, "", False, "", "Nothing", "", "continue"),
         (RunState.CANCELLED, "", False, "", "Nothing", "", "continue"),
         (RunState.CANCELLED, "No disk.", True, "No disk.", "Nothing", "", "continue"),
-        (RunState.DONE, "", False, "", "Nothing", "", "again"),
+        (RunState.DONE, "", False, "", "Nothing", "", "start"),
         (RunState.DONE, "", True, "", "Nothing", "", "continue"),
     ],
 )
@@ -38,6 +38,13 @@ def test_what_is_enabled_in_each_state(state, problem, unfinished, start, cancel
     for text, expected in ((found.start, start), (found.cancel, cancel), (found.settings, settings)):
         assert expected in text and bool(text) == bool(expected)
     assert found.action == action
+
+
+@pytest.mark.parametrize("state", [RunState.IDLE, RunState.DONE])
+def test_what_is_there_is_made_again_also_in_a_case_that_was_opened_anew(state):
+    assert controls(state, finished=True).action == "again"
+    assert controls(state, unfinished=True, finished=True).action == "continue"
+    assert controls(state).action == "start"
 
 
 def test_every_state_has_a_control_that_is_enabled_or_is_passing():

@@ -17,6 +17,7 @@ from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.case.recorded import CaseReader
+from ExpectedAppearancesLib.case.steps import Study
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.evaluation import study_frames
@@ -102,6 +103,7 @@ def until(run: Run, condition):
 def test_a_study_runs_is_cancelled_resumed_and_fills_the_table(studied):
     folder, options = studied.case.folder, ["--frames", "3", "--preset", "quick", "--minutes", "1"]
     reader = CaseReader()
+    assert reader.recorded(str(folder), "surface", Limits()).study is Study.NONE
     (studied.trainer / "wait").write_text("quick-strict-b")
     run = Run.start("study", folder, options)
     status = until(run, lambda s: re.search(r"^2 of \d: quick model without b, unseen poses: ", s.message))
@@ -111,7 +113,7 @@ def test_a_study_runs_is_cancelled_resumed_and_fills_the_table(studied):
     run.cancel()
     assert run.wait(120).state is RunState.CANCELLED
     recorded = reader.recorded(str(folder), "surface", Limits())
-    assert recorded.study_stopped and recorded.verdict is None
+    assert recorded.study is Study.STOPPED and recorded.verdict is None
     assert "not found" in result_problem("study", folder)
 
     (studied.trainer / "wait").unlink()
@@ -121,7 +123,7 @@ def test_a_study_runs_is_cancelled_resumed_and_fills_the_table(studied):
     names = [words[words.index("--exclude") + 1] for words in calls(studied)]
     assert names == ["a", "b", "b", "a", "b"]  # of the first run a, and b until it was cancelled
     recorded = reader.recorded(str(folder), "surface", Limits())
-    assert not recorded.study_stopped and recorded.validation == "known" and recorded.verdict[0] is False
+    assert recorded.study is Study.DONE and recorded.validation == "known" and recorded.verdict[0] is False
     rows = reader.figures(studied.case)[0]
     assert [(row.protocol, row.style) for row in rows] == [(p, s) for p in ("strict", "loto") for s in ("", "a", "b")]
     assert all(row.add_mm_mean > 0 for row in rows)

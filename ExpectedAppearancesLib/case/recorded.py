@@ -14,7 +14,7 @@ from ..appearances.store import METHODS, newest_image
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
 from .case import MANIFEST_NAME, Case
-from .steps import Recorded
+from .steps import Recorded, Study
 
 STOPPED = ("cancelled", "failed")  # outcomes of a run as its record names them
 LARGEST_HEADER_BYTES = 1 << 24
@@ -56,7 +56,7 @@ class CaseReader:
             state.get("step", 0),
             "stale" if stale else "known" if rows else "",
             verdict(rows, limits) if rows else None,
-            (self._once(case.folder / "runs" / "study.json", _read_object) or {}).get("outcome") in STOPPED,
+            self._study(case),
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:
@@ -99,6 +99,11 @@ class CaseReader:
             case.__dict__.update({n: known.__dict__[n] for n in ("vessels", "cortex") if n in known.__dict__})
         self._case = case
         return case, ""
+
+    def _study(self, case: Case) -> Study:
+        if (self._once(case.folder / "runs" / "study.json", _read_object) or {}).get("outcome") in STOPPED:
+            return Study.STOPPED
+        return Study.DONE if (case.folder / "study" / "study.json").is_file() else Study.NONE
 
     def _overview_changed(self, case: Case, index: dict, index_sha256: str) -> bool:
         craniotomy = case.manifest["stages"].get("render", {}).get("craniotomy")

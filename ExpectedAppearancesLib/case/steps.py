@@ -41,6 +41,14 @@ class Step:
     text: str
 
 
+class Study(Enum):
+    """How the last study of the case ended."""
+
+    NONE = "none"
+    STOPPED = "stopped"
+    DONE = "done"
+
+
 @dataclass(frozen=True)
 class Chosen:
     """What is chosen in the panel now.
@@ -74,9 +82,8 @@ class Recorded:
     """What the case folder holds: case.json, the camera, the index of the appearances, model.json; None where absent.
 
     overview_changed: the view that method `surface` synthesises on is another one now. appearances_sha256: of the
-    index. steps_trained: of a training that was stopped, 0 where there is none. study_stopped: the last study was ended
-    before it was done. validation: whether figures are there,
-    verdict of `evaluation.verdict` on them: (ready, reasons).
+    index. steps_trained: of a training that was stopped, 0 where there is none. validation: whether figures are
+    there, verdict of `evaluation.verdict` on them: (ready, reasons).
     """
 
     problem: str = ""
@@ -89,7 +96,7 @@ class Recorded:
     steps_trained: int = 0
     validation: str = ""
     verdict: tuple[bool, tuple[str, ...]] | None = None
-    study_stopped: bool = False
+    study: Study = Study.NONE
 
 
 def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
@@ -279,7 +286,7 @@ def _validation(chosen: Chosen, recorded: Recorded) -> Step:
     if "study" in chosen.running:
         return Step(StepState.RUNNING, "A study is going on: for each texture a model is trained without it.")
     if recorded.verdict is None:
-        if recorded.study_stopped:
+        if recorded.study is Study.STOPPED:
             return Step(StepState.READY, "The study was stopped; it goes on where it was.")
         if recorded.model is not None:
             return Step(StepState.MISSING, "No figures yet.")

@@ -53,10 +53,11 @@ GOES_ON = "A run is going on; cancel it first."
 BEING_ENDED = "The run is being ended; wait a moment."
 
 
-def controls(state: RunState, problem: str = "", unfinished: bool = False) -> Controls:
+def controls(state: RunState, problem: str = "", unfinished: bool = False, finished: bool = False) -> Controls:
     """State -> what is enabled.
 
-    problem: why no run can begin ('' if nothing is in the way). unfinished: the case holds the beginning of a result.
+    problem: why no run can begin ('' if nothing is in the way). unfinished: the case holds the beginning of a result;
+    finished: it holds all of it.
     """
     if state is RunState.CANCELLING:
         return Controls(BEING_ENDED, BEING_ENDED, BEING_ENDED, "continue")
@@ -65,5 +66,5 @@ def controls(state: RunState, problem: str = "", unfinished: bool = False) -> Co
     if unfinished or state in (RunState.FAILED, RunState.CANCELLED):
         action = "continue"
     else:
-        action = "again" if state is RunState.DONE else "start"
+        action = "again" if finished else "start"
     return Controls(problem, NOTHING_RUNS, "", action)

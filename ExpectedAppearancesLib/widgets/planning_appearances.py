@@ -45,7 +45,7 @@ class AppearancesSection(Section):
                 problem = problem or self.reason_of(name)
         problem = in_the_way(self.panel, "synthesize") or problem or self.panel.help.reason("training")
         index = self.panel.recorded.index
-        self.controls.refresh(problem, unfinished=bool(index and not index["done"]), said=step.text)
+        self.controls.refresh(problem, bool(index and not index["done"]), step.state is StepState.DONE, step.text)
         self._show_newest(p)
 
     def close(self) -> None:

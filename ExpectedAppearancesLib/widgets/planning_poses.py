@@ -6,6 +6,7 @@ import numpy as np
 import slicer
 from slicer.i18n import tr as _
 
+from ..case.steps import StepState
 from ..errors import InputError
 from ..mrml import planning
 from .planning_look import Looking
@@ -74,7 +75,7 @@ class PosesSection(Section):
         elif self.panel.steps["case"].state.value == "stale":
             blocked = _("Save the case first: {reason}").format(reason=self.panel.steps["case"].text)
         blocked = in_the_way(self.panel, "render") or self.session.waiting(p) or blocked
-        self.controls.refresh(blocked, unfinished=False, said=self.step.text)
+        self.controls.refresh(blocked, False, self.step.state is StepState.DONE, self.step.text)
 
     def _show_automatic(self, p, sampler) -> None:
         """What the automatic ranges come to, in the disabled fields."""

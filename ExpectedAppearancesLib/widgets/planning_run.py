@@ -99,10 +99,10 @@ class RunControls:
         self._start, self._cancel, self._bar, self._label = start_button, cancel_button, bar, label
         self._start_hint, self._texts = start_hint, texts
 
-    def refresh(self, problem: str, unfinished: bool, said: str = "") -> None:
-        """problem: why no run can begin, '' if nothing is in the way. said: what the section's status line says."""
+    def refresh(self, problem: str, unfinished: bool, finished: bool, said: str) -> None:
+        """problem, unfinished, finished: see `controls`. said: what the section's status line says."""
         status = self.watch.status
-        state = controls(status.state, problem, unfinished)
+        state = controls(status.state, problem, unfinished, finished)
         allow(self._start, state.start, self._start_hint)
         allow(self._cancel, state.cancel, _("End the run. What is finished is kept."))
         set_text(self._start, _(self._texts[state.action]))

@@ -60,7 +60,7 @@ class TrainingSection(Section):
         if before.state is not StepState.DONE:
             problem = problem or self.reason_of("appearances")
         problem = in_the_way(self.panel, "train") or problem or self.panel.help.reason("training")
-        self.controls.refresh(problem, unfinished=self._unfinished(), said=self.step.text)
+        self.controls.refresh(problem, self._unfinished(), self.step.state is StepState.DONE, self.step.text)
         curve = self._curve(self.session.case(p))
         allow(
             ui.showLossButton, "" if curve else _("Nothing has been trained yet."), _("Show the plot of loss and ADD.")

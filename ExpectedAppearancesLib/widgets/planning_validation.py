@@ -7,7 +7,7 @@ import html
 import slicer
 from slicer.i18n import tr as _
 
-from ..case.steps import StepState
+from ..case.steps import StepState, Study
 from ..evaluation.verdict import PROTOCOL_NAMES
 from ..gpus import device_arguments
 from ..mrml import charts
@@ -45,7 +45,8 @@ class ValidationSection(Section):
         rows = self._rows()
         recorded = self.panel.recorded
         textures = {item["style"] for item in recorded.index["items"]} if recorded.index else set()
-        self.controls.refresh(self._problem(len(textures)), recorded.study_stopped, said=self.step.text)
+        problem, study = self._problem(len(textures)), recorded.study
+        self.controls.refresh(problem, study is Study.STOPPED, study is Study.DONE, self.step.text)
         self._show_hint(len(textures))
         allow(
             self.ui.showFiguresButton,
