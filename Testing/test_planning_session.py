@@ -142,6 +142,22 @@ def test_textures_are_compared_with_what_was_synthesised(planned, tmp_path):
     assert session.textures_folder(parameters()) == shipped_textures_folder()
 
 
+def test_a_case_is_opened_with_the_textures_it_was_made_with(scene, planned, tmp_path):
+    session, p = planned
+    p.casePath, own = str(tmp_path / "case"), tmp_path / "Meine Fotos"
+    case = save(session, p, tmp_path)
+    for folder, expected in ((None, ""), ("", ""), (str(own), str(own))):
+        if folder is not None:
+            case.record("synthesize", textures_folder=folder)
+        other = parameters(casePath=p.casePath, texturesPath="those of the case before")
+        adopt(session, other, scene)
+        assert other.texturesPath == expected
+    assert "no longer there" in session.steps(other)["textures"].text  # said, not taken for the ones that ship
+    (case.folder / "textures").mkdir()
+    adopt(session, other, scene)
+    assert other.texturesPath == str(case.folder / "textures")
+
+
 def test_microscope_from_its_field_of_view(planned):
     session, p = planned
     p.cameraSource = Source.VIEW

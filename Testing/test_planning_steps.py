@@ -138,6 +138,7 @@ STEEPER = {**POSES, "ranges": RANGES | {"tilt_max_deg": 60.0}}
         (lambda c, r: (replace(c, textures=SIX | {"new": "x"}), r), "appearances", STALE, "new was added"),
         (lambda c, r: (replace(c, textures=SIX | {"t1": "other"}), r), "appearances", STALE, "t1 was changed"),
         (lambda c, r: (replace(c, textures=SIX | {"t1": ""}), r), "appearances", DONE, "6"),
+        (lambda c, r: (replace(c, textures={}, textures_problem="gone"), r), "appearances", DONE, "6"),
         (lambda c, r: (replace(c, synthesis={"size_px": 256}), r), "appearances", STALE, "size"),
         (lambda c, r: (c, replace(r, overview_changed=True)), "appearances", STALE, "craniotomy"),
         (lambda c, r: (c, replace(r, index=None)), "appearances", READY, "start"),

@@ -122,6 +122,7 @@ def test_gram_distance_is_in_the_index_the_sheet_and_the_output(case, tmp_path, 
     files.write_png(tmp_path / "textures" / "labels.png", texture(size=96).labels)
     arguments = [str(case.folder), "--textures", str(tmp_path / "textures"), "--size", "48", "--iterations", "2"]
     assert main(["synthesize", *arguments]) == 0
+    assert Case.open(case.folder).manifest["stages"]["synthesize"]["textures_folder"] == str(tmp_path / "textures")
     (item,) = store.read_index(case, "surface")["items"]
     assert set(item["gram_distance_by_class"]) == {"parenchyma", "vessels"}
     assert item["gram_distance"] == pytest.approx(sum(item["gram_distance_by_class"].values()), abs=2e-4)

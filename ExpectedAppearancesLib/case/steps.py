@@ -246,7 +246,7 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
             changed.append(name)
     if recorded.overview_changed:
         changed.append("the craniotomy")
-    if index["done"]:
+    if index["done"] and not chosen.textures_problem:  # of what cannot be read nobody knows whether it changed
         textures = changes_of_textures(chosen.textures, index)
         changed += textures if len(textures) <= 2 else ["the textures"]
     if changed:

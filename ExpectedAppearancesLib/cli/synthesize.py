@@ -98,6 +98,8 @@ def _synthesize(args, case, textures, progress) -> None:
         weights = download_vgg19(Path.home() / ".cache" / "expected-appearances")
     if not textures:
         raise InputError(f"{args.textures}: no texture is left after --exclude; leave fewer out.")
+    # Where a panel finds them again; '' for those that ship.
+    case.record("synthesize", textures_folder=str(args.textures.absolute()) if args.textures else "")
     distances = synthesize_case(
         case,
         textures,

@@ -80,7 +80,7 @@ def _adopt_settings(parameters, case: Case, automatic: PoseRanges) -> None:
         parameters.preset = type(parameters.preset)(preset["name"])
         _take(parameters, "minutes", preset.get("minutes"))
     own_textures = case.folder / "textures"
-    parameters.texturesPath = str(own_textures) if own_textures.is_dir() else parameters.texturesPath
+    parameters.texturesPath = str(own_textures) if own_textures.is_dir() else synthesize.get("textures_folder", "")
 
 
 def _models(scene, case: Case, added: list) -> Generator[None, None, dict]:

@@ -37,6 +37,8 @@ class HelpSection:
         text = _("Missing Python packages: {names}.").format(names=", ".join(names))
         self.ui.missingLabel.text = text if names else _("All Python packages are there.")
         reason = "" if names else _("Nothing is missing.")
+        if names and self.panel.running():  # what it has loaded must not be replaced beneath it
+            reason = _("A run is going on, which uses these packages; wait until it is ready, or cancel it.")
         allow(self.ui.installButton, reason, _("Download and install them; you are asked first."))
         allow(self.ui.installFolderButton, reason, _("Install them from a folder of wheels, without a network."))
         busy = _("The system is being checked.") if self._checking else ""

@@ -75,7 +75,9 @@ class PosesSection(Section):
         elif self.panel.steps["case"].state.value == "stale":
             blocked = _("Save the case first: {reason}").format(reason=self.panel.steps["case"].text)
         blocked = in_the_way(self.panel, "render") or self.session.waiting(p) or blocked
-        self.controls.refresh(blocked, False, self.step.state is StepState.DONE, self.step.text)
+        manifest, state = self.panel.recorded.manifest, self.step.state
+        begun = bool(manifest and manifest["stages"].get("render"))
+        self.controls.refresh(blocked, begun and state is StepState.READY, state is StepState.DONE, self.step.text)
 
     def _show_automatic(self, p, sampler) -> None:
         """What the automatic ranges come to, in the disabled fields."""

@@ -287,6 +287,7 @@ def test_run_is_found_again_and_cancelled(test) -> None:
         open_case(test, panel, folder / "case")
         test.assertEqual(panel.steps["poses"].state, StepState.READY, panel.steps["poses"].text)
         test.assertIn("goes on where it was", panel.steps["poses"].text)
+        test.assertEqual(panel.ui.renderButton.text, "Continue")
 
 
 def test_plots_leave_no_nodes_behind(test) -> None:
@@ -357,6 +358,12 @@ def test_from_models_to_a_trained_model(test) -> None:
         test.assertTrue(panel.ui.verdictLabel.text)
         test.assertIsNotNone(charts.chart_of(slicer.mrmlScene, "training.chart"))
         _start_and_cancel_a_study(test, panel)
+        slicer.mrmlScene.Clear()
+        open_case(test, panel, case.folder)
+        p = panel.parameters
+        test.assertEqual(panel.ui.renderButton.text, "Make again")
+        test.assertEqual(panel.ui.trainingStart.text, "Make again")
+        test.assertEqual(panel.ui.studyStart.text, "Continue the study")
         p.poseCount = 5
         panel.refresh()
         test.assertEqual(panel.steps["poses"].state, StepState.STALE)
