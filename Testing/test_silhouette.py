@@ -86,3 +86,15 @@ def test_what_is_drawn_of_an_outline_has_its_own_numbers():
     used, lines = silhouette.renumbered(edges)
     np.testing.assert_array_equal(used[lines], edges)
     assert sorted(set(edges.ravel().tolist())) == used.tolist()
+
+
+def test_where_three_triangles_meet_the_edge_is_an_outline_unless_all_face_the_camera():
+    vertices = np.array([[0, 0, 0], [0, 1, 0], [1, 0.5, 0.2], [-1, 0.5, 0.2], [0.2, 0.5, 1.0]], float)
+    pose = look_at(np.array([0.1, 0.5, 9.0]), np.array([0.1, 0.5, 0.0]), np.array([0.0, 1.0, 0.0]))
+    right, left, up = (0, 2, 1), (0, 1, 3), (0, 4, 1)  # all of them face the camera
+    for third, expected in ((up, False), (up[::-1], True)):
+        silhouette = Silhouette(vertices, np.array([right, left, third]))
+        assert silhouette.towards(pose).tolist() == [True, True, not expected]
+        assert ((0, 1) in map(tuple, silhouette.edges(pose).tolist())) == expected
+        edges, within = silhouette.edges_with_inside(pose)
+        assert dict(zip(map(tuple, edges.tolist()), within.tolist())).get((0, 1)) in ((2, 3) if expected else (None,))

@@ -23,12 +23,17 @@ class Silhouette:
         count, low = len(self._vertices_mm), np.minimum(starts, ends).astype(np.int64)
         keys, edge_of_side = np.unique(low * count + np.maximum(starts, ends), return_inverse=True)
         self._edges = np.stack([keys // count, keys % count], axis=1)
-        self._sides = np.bincount(edge_of_side.ravel(), minlength=len(keys))
-        # The triangles at each edge and the way they go along it, those of one edge behind one another.
+        self._sides = np.bincount(edge_of_side.ravel(), minlength=len(keys)).astype(np.int16)
+        self._is_border = self._sides == 1
+        # The triangles at each edge and the way they go along it, one per row; where an edge has fewer, one that is not
+        # there, behind all others.
         order = np.argsort(edge_of_side.ravel(), kind="stable")
-        self._triangles_at = order % max(1, len(triangles))
-        self._sign_at = np.where(starts < ends, 1, -1).astype(np.int8)[order]
-        self._first_at = np.cumsum(self._sides) - self._sides
+        edge = edge_of_side.ravel()[order]
+        row = np.arange(len(order)) - (np.cumsum(self._sides, dtype=int) - self._sides)[edge]
+        self._triangles_at = np.full((self._sides.max(initial=0), len(keys)), len(triangles))
+        self._triangles_at[row, edge] = order % max(1, len(triangles))
+        self._signs_at = np.zeros(self._triangles_at.shape, np.int8)
+        self._signs_at[row, edge] = np.where(starts < ends, 1, -1)[order]
         self.is_closed = bool((self._sides == 2).all())
 
     def edges(self, camera_from_world: np.ndarray, facing_borders_only: bool = False) -> np.ndarray:
@@ -40,44 +45,33 @@ class Silhouette:
 
     def edges_facing(self, towards: np.ndarray, facing_borders_only: bool = False) -> np.ndarray:
         """As `edges`, from what `towards` said (F,)."""
-        facing = self._sum_at(towards[self._triangles_at])
-        return self._edges[self._is_outline(facing, facing_borders_only)]
+        return self._edges[self._is_outline(self._at_edges(towards), facing_borders_only)]
 
     def boundary(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The closed curves around the triangles chosen (F,): edges (E, 2) and how often each is gone along (E,).
 
         Negative: from its second vertex to its first. Edges between two of the triangles cancel.
         """
-        weight = self._sum_at(self._sign_at * chosen[self._triangles_at])
+        weight = (self._at_edges(chosen) * self._signs_at).sum(axis=0, dtype=np.int16)
         there = np.flatnonzero(weight)
         return self._edges[there], weight[there]
 
     def edges_with_inside(self, camera_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `edges` with facing borders only, and for each edge (E,) the third vertex of a triangle at it that faces
         the camera: the side on which the surface is seen."""
-        towards_at = self.towards(camera_from_world)[self._triangles_at]
-        chosen = np.flatnonzero(self._is_outline(self._sum_at(towards_at), facing_borders_only=True))
-        # At each edge the first of its triangles that faces the camera; only few edges have more than two.
-        first, sides = self._first_at[chosen], self._sides[chosen]
-        side, found = first.copy(), np.zeros(len(chosen), bool)
-        for i in range(sides.max(initial=0)):
-            new = ~found & (i < sides)
-            new[new] = towards_at[first[new] + i]
-            side[new], found = first[new] + i, found | new
-        edges = self._edges[chosen]
-        return edges, self._triangles[self._triangles_at[side]].sum(axis=1) - edges.sum(axis=1)
+        towards_at = self._at_edges(self.towards(camera_from_world))
+        chosen = np.flatnonzero(self._is_outline(towards_at, facing_borders_only=True))
+        edges, first = self._edges[chosen], towards_at[:, chosen].argmax(axis=0)
+        return edges, self._triangles[self._triangles_at[first, chosen]].sum(axis=1) - edges.sum(axis=1)
 
-    def _sum_at(self, values_at: np.ndarray) -> np.ndarray:
-        """Sum at each edge of small values (bool or int8) of the triangles there."""
-        if self.is_closed:
-            return values_at[0::2].view(np.int8) + values_at[1::2].view(np.int8)
-        running = np.zeros(len(values_at) + 1, np.int32)
-        np.cumsum(values_at, out=running[1:])
-        return running[self._first_at + self._sides] - running[self._first_at]
+    def _at_edges(self, said: np.ndarray) -> np.ndarray:
+        """What is said of each triangle (F,), bool, for those at each edge (S, E); False where none is."""
+        return np.append(said, False)[self._triangles_at]
 
-    def _is_outline(self, facing: np.ndarray, facing_borders_only: bool) -> np.ndarray:
-        border = (self._sides == 1) & (facing >= (1 if facing_borders_only else 0))
-        return border | ((facing > 0) & (facing < self._sides))
+    def _is_outline(self, towards_at: np.ndarray, facing_borders_only: bool) -> np.ndarray:
+        facing = towards_at.sum(axis=0, dtype=np.int16)
+        between = (facing > 0) & (facing < self._sides)
+        return between | (self._is_border & (facing > 0) if facing_borders_only else self._is_border)
 
     def towards(self, camera_from_world: np.ndarray) -> np.ndarray:
         """bool (F,): whether each triangle faces the camera."""

@@ -8,6 +8,7 @@ Numpy and OpenCV only.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -199,31 +200,38 @@ class _EdgeSearch:
     ) -> tuple[np.ndarray, np.ndarray, int] | None:
         """Offset of the step along each normal that is most like the expected one, px (E,), its weight (E,), and how
         many points lie on tissue; None when these are too few."""
-        samples_px = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
+        samples_px, across, step = _search(reach_px)
         where = _along(points_px, normals, samples_px)
         on_tissue = _on_tissue(self.dark, where)
         tissue = int(on_tissue.sum())
         if tissue < LEAST_POINTS:
             return None
         values = cv2.remap(self.values, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        middle, nearest, farthest = len(samples_px) // 2, round(NEAREST_PX / STEP_PX), round(FARTHEST_PX / STEP_PX)
-        inside = values[:, middle - farthest : middle - nearest + 1].mean(axis=1)
-        outside = values[:, middle + nearest : middle + farthest + 1].mean(axis=1)
-        expected = max(float((inside - outside) @ on_tissue) / tissue, 1e-9)
-        window = round(WINDOW_PX / STEP_PX)
-        # Column i: the sum of the `window` samples from the i-th on.
-        sums = cv2.boxFilter(values, -1, (window, 1), anchor=(0, 0), normalize=False)[:, : 1 - window]
-        at = np.arange(window, len(samples_px) - window)
-        response = (sums[:, : len(at)] - sums[:, window + 1 :]) / (window * expected)
-        best, rows = np.clip(response.argmax(axis=1), 1, len(at) - 2), np.arange(len(response))
-        before, peak, after = (response[rows, best + i] for i in (-1, 0, 1))
+        expected = max(float((values @ across) @ on_tissue) / tissue, 1e-9)
+        response, margin = cv2.filter2D(values, -1, step), step.shape[1] // 2
+        best = response[:, margin:-margin].argmax(axis=1) + margin
+        best = np.clip(best, margin + 1, len(samples_px) - margin - 2)
+        place, flat = best + len(samples_px) * np.arange(len(best)), response.ravel() / np.float32(expected)
+        before, peak, after = flat[place - 1], flat[place], flat[place + 1]
         bend = before - 2 * peak + after
         between = np.where(bend < -1e-9, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
-        offsets_px = samples_px[at[best]] + STEP_PX * np.clip(between, -1, 1)
+        offsets_px = samples_px[best] + STEP_PX * np.clip(between, -1, 1)
         last = reach_px - WINDOW_PX + STEP_PX
         near = np.clip(1 - (offsets_px / last) ** 2, 0, 1) ** 2
         is_peak = (peak >= before) & (peak >= after)
         return offsets_px, np.clip(peak, 0, 1.5) * near * is_peak * on_tissue, tissue
+
+
+@functools.lru_cache(maxsize=8)
+def _search(reach_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets of the samples (K,), what takes from them the mean difference of inside and outside (K,), and the filter
+    (1, 2 W + 1) that answers to a step between the means of W samples before and behind."""
+    samples_px = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
+    beside = (np.abs(samples_px) > NEAREST_PX - STEP_PX / 2) & (np.abs(samples_px) < FARTHEST_PX + STEP_PX / 2)
+    across = np.where(beside, -2 * np.sign(samples_px) / beside.sum(), 0).astype(np.float32)
+    window = round(WINDOW_PX / STEP_PX)
+    step = np.sign(np.arange(window, -window - 1, -1))[None] / window
+    return samples_px, across, step.astype(np.float32)
 
 
 def _along(points_px: np.ndarray, normals: np.ndarray, offsets_px: np.ndarray) -> np.ndarray:

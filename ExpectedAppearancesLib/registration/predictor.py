@@ -124,13 +124,13 @@ class Predictor:
         """The frame as the camera `wanted` would have taken it: undistorted, same centre of projection."""
         shrink = wanted.fx / camera.fx
         if shrink < 0.75:
-            # Averaged down first, since remap samples single pixels and would alias. By whole pixels at first, as far
-            # as it goes: averaging over fractions of pixels costs ten times as much.
+            # Averaged down first, since remap samples single pixels and would alias. By halves at first, as far as they
+            # go: averaging over fractions of pixels costs ten times as much.
             size = (max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
-            times = int(0.5 / shrink)
-            if times > 1 and camera.width % times == 0 and camera.height % times == 0:
-                whole = (camera.width // times, camera.height // times)
-                image_rgb = cv2.resize(image_rgb, whole, interpolation=cv2.INTER_AREA)
+            width, height = camera.width, camera.height
+            while width >= 2 * size[0] and height >= 2 * size[1] and width % 2 == height % 2 == 0:
+                width, height = width // 2, height // 2
+                image_rgb = cv2.resize(image_rgb, (width, height), interpolation=cv2.INTER_AREA)
             image_rgb = cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA)
             camera = camera.resized(*size)
         key = (camera, wanted)
