@@ -74,6 +74,51 @@ def test_alignment_by_handles_sliders_and_landmarks_gives_the_true_pose(applicat
     controller.close()
 
 
+def test_alignment_holds_when_the_user_transforms_the_models(application, phantom, model, frames):
+    """Landmarks are picked where the vessels are seen: moved by the user's transform, and by the handles."""
+    import vtk
+
+    from ExpectedAppearancesLib.mrml.live_align import add_landmark_lists
+
+    scene, _logic = application
+    true = frames[0][2]
+    node_with(scene, frames[1][2])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    patient = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Patient moved")
+    moved = vtk.vtkTransform()
+    moved.Translate(40, -25, 60)
+    moved.RotateWXYZ(50, 1, 2, -0.5)
+    patient.SetMatrixTransformToParent(moved.GetMatrix())
+    models = controller.live.models.values()
+    for node in models:
+        node.SetAndObserveTransformNodeID(patient.GetID())
+    controller.live.follow_models()
+
+    alignment = controller.begin_alignment()
+    start = alignment.camera_from_world
+    assert add_of(phantom, start, controller.result.camera_from_world) < 1e-6
+    controller.nudge(np.array([4.0, -3.0, 6.0]), np.array([5.0, 2.0, -9.0]), start)
+    in_frame, on_mesh = add_landmark_lists(controller.live)
+    vertices = phantom.case.vessels.vertices_mm[:: len(phantom.case.vessels.vertices_mm) // 6][:6]
+    in_camera = vertices @ true[:3, :3].T + true[:3, 3]
+    to_world = vtk.vtkMatrix4x4()
+    alignment.handles.GetMatrixTransformToWorld(to_world)
+    for point, seen in zip(vertices, in_camera):
+        clicked = to_world.MultiplyPoint((*(point * [-1, -1, 1]), 1.0))[:3]
+        on_mesh.SetNthControlPointPositionWorld(on_mesh.AddControlPoint(0, 0, 0), *clicked)
+        index = in_frame.AddControlPoint(0, 0, 0)
+        in_frame.SetNthControlPointPosition(index, *(seen * controller.live.plane_mm / seen[2]))
+    assert controller.align_to_landmarks(in_frame, on_mesh) < 0.01
+    controller.finish_alignment(keep=True)
+    assert add_of(phantom, true, controller.truth) < 0.01
+    assert {node.GetTransformNodeID() for node in models} == {patient.GetID()}
+    for node in (in_frame, on_mesh, patient):
+        scene.RemoveNode(node)
+    controller.close()
+
+
 def test_true_poses_are_collected_for_evaluation(application, phantom, model, frames, tmp_path):
     scene, _logic = application
     stream = node_with(scene, frames[1][2])

@@ -38,6 +38,8 @@ class Alignment:
             display.SetEditorScalingEnabled(False)
         if hasattr(self.handles, "SetCenterOfTransformation"):  # the handles then sit in the vessels, not at 0
             self.handles.SetCenterOfTransformation(*pivot_ras)
+        self._parents = {name: node.GetTransformNodeID() for name, node in live_scene.models.items()}
+        self.handles.SetAndObserveTransformNodeID(self._parents[scenes.VESSELS])  # where the user put them
         for node in live_scene.models.values():
             node.SetAndObserveTransformNodeID(self.handles.GetID())
 
@@ -56,9 +58,9 @@ class Alignment:
     def finish(self, keep: bool = True) -> np.ndarray:
         """Put the vessels back to their place and, if kept, the camera to its; returns the pose."""
         pose = self.camera_from_world if keep else self._start
-        for node in self._live.models.values():
+        for name, node in self._live.models.items():
             if self._scene.IsNodePresent(node):
-                node.SetAndObserveTransformNodeID(None)
+                node.SetAndObserveTransformNodeID(self._parents[name])
         if self._scene.IsNodePresent(self.handles):
             display = self.handles.GetDisplayNode()
             self._scene.RemoveNode(self.handles)
@@ -69,7 +71,8 @@ class Alignment:
 
 
 def add_landmark_lists(live_scene: LiveScene) -> tuple:
-    """Two lists of points, (in the frame, on the mesh). Those of the frame lie in camera mm and move with it."""
+    """Two lists of points, (in the frame, on the mesh). Those of the frame lie in camera mm and move with it, those on
+    the mesh move with the vessels."""
     nodes = []
     for role, name, rgb in (
         (FRAME_LANDMARKS, "F", (1.0, 0.82, 0.2)),
@@ -81,24 +84,26 @@ def add_landmark_lists(live_scene: LiveScene) -> tuple:
         node.GetDisplayNode().SetSelectedColor(*rgb)
         nodes.append(node)
     nodes[0].SetAndObserveTransformNodeID(live_scene.transform.GetID())
+    nodes[1].SetAndObserveTransformNodeID(live_scene.models[scenes.VESSELS].GetTransformNodeID())
     return tuple(nodes)
 
 
 def pose_of_landmarks(live_scene: LiveScene, case: Case, in_frame, on_mesh) -> LandmarkPose:
     """The pose that the two lists give for the frame that is shown. Raises InputError as pose_from_landmarks does."""
     camera = live_scene.camera
-    points_mm = _points(in_frame, world=False)
+    points_mm = _points(in_frame)
     points_px = points_mm[:, :2] / points_mm[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     world_from_ras = inverse(RAS_FROM_LPS if case.space == "LPS" else np.eye(4))
-    return pose_from_landmarks(points_px, transform(world_from_ras, _points(on_mesh, world=True)), camera)
+    return pose_from_landmarks(points_px, transform(world_from_ras, _points(on_mesh)), camera)
 
 
-def _points(markups, world: bool) -> np.ndarray:
+def _points(markups) -> np.ndarray:
+    """Its defined points (N, 3), under its own transform: where they were picked, however far that moved since."""
     points = []
     for i in range(markups.GetNumberOfControlPoints()):
         if markups.GetNthControlPointPositionStatus(i) != markups.PositionDefined:
             continue
         position = [0.0, 0.0, 0.0]
-        (markups.GetNthControlPointPositionWorld if world else markups.GetNthControlPointPosition)(i, position)
+        markups.GetNthControlPointPosition(i, position)
         points.append(position)
     return np.array(points, float).reshape(-1, 3)
