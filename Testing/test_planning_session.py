@@ -52,6 +52,17 @@ def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
         assert scene.GetNumberOfNodesByClass("vtkMRMLModelNode") == count + 2
 
 
+def test_models_follow_a_transform_that_is_put_above_theirs_or_taken_away(scene, planned):
+    session, p = planned
+    outer, parent = add_transform(scene, turned()), p.vesselsNode.GetParentTransformNode()
+    parent.SetMatrixTransformToParent(vtk.vtkMatrix4x4())  # the newer of the two: its time is that of the chain
+    expected = {None: cases.vessels().vertices_mm * LPS}
+    expected[outer] = (cases.vessels().vertices_mm @ turned()[:3, :3].T + turned()[:3, 3]) * LPS
+    for above in (outer, None, outer):
+        parent.SetAndObserveTransformNodeID(above.GetID() if above else None)
+        np.testing.assert_allclose(session.mesh(p, "vessels").vertices_mm, expected[above], atol=1e-4)
+
+
 def test_a_case_that_is_not_opened_to_the_end_leaves_nothing_in_the_scene(scene, planned, tmp_path):
     session, p = planned
     p.casePath = str(tmp_path / "case")

@@ -274,10 +274,8 @@ class PlanningSession:
         case, node = self.case(parameters), parameters.mriVolume
         if case is None or node is None or not (node.GetImageData() and node.GetImageData().GetNumberOfPoints()):
             return None
-        parent = node.GetParentTransformNode()
         placed = tuple(mri.placement(node))
-        moved = parent.GetTransformToWorldMTime() if parent else 0
-        version = (node.GetID(), node.GetImageData().GetMTime(), placed, moved)
+        version = (node.GetID(), node.GetImageData().GetMTime(), placed, _moved(node))
         identity = self._once("mri", version, lambda: mri.scan_identity(node))
         known = self._once(
             "mri.known", (version, case.folder, _Same(case.manifest)), lambda: mri.is_scan_of(case, identity)
@@ -370,13 +368,23 @@ def write_plain_mesh(path: Path, mesh: Mesh, space: str) -> None:
 
 def _version_of(node, segment_id: str = "") -> tuple:
     """Changes with the node's content and with the transforms above it."""
-    parent = node.GetParentTransformNode()
-    moved = parent.GetTransformToWorldMTime() if parent else 0
+    moved = _moved(node)
     if node.IsA("vtkMRMLSegmentationNode"):
         return (voxels_version(node, segment_id), moved)
     if node.IsA("vtkMRMLModelNode"):
         return (node.GetPolyData().GetMTime() if node.GetPolyData() else 0, moved)
     raise ValueError(f"{node.GetClassName()}: neither model nor segmentation")
+
+
+def _moved(node) -> tuple:
+    """Changes with the transforms above a node: with each of them, and with which ones they are."""
+    parent = node.GetParentTransformNode()
+    modified, above = parent.GetTransformToWorldMTime() if parent else 0, []
+    while parent is not None:
+        above.append(parent.GetID())
+        parent = parent.GetParentTransformNode()
+    # A transform that is taken out of the chain leaves the time as it was, where it was set before the others.
+    return (modified, *above)
 
 
 class _Same:
