@@ -18,6 +18,7 @@ from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.masks.stage import render_case
 from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
+from ExpectedAppearancesLib.textures.library import list_textures, shipped_textures_folder
 
 
 def records(folder) -> list[str]:
@@ -129,6 +130,14 @@ def test_gram_distance_is_in_the_index_the_sheet_and_the_output(case, tmp_path, 
     assert f"parenchyma {item['gram_distance_by_class']['parenchyma']:.3f}" in capsys.readouterr().out
     sheet = files.read_image_rgb(store.folder_of(case, "surface") / "contact_sheet.png")
     assert (sheet[:22] < 128).any() and (sheet[22:44, :400] < 128).any()  # the lines with the figures
+
+
+def test_the_shipped_textures_are_not_taken_for_a_folder_of_the_users_own(case):
+    """The panel names them as any other folder; opened again, it would add photographs to them, and remove some."""
+    shipped = shipped_textures_folder()
+    named = ["--textures", str(shipped), "--exclude", *list(list_textures(shipped))[1:]]
+    assert main(["synthesize", str(case.folder), *named, "--size", "32", "--iterations", "1"]) == 0
+    assert Case.open(case.folder).manifest["stages"]["synthesize"]["textures_folder"] == ""
 
 
 def test_a_claim_has_one_holder_until_it_is_released(tmp_path):

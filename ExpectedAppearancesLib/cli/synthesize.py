@@ -90,6 +90,7 @@ def _synthesize(args, case, textures, progress) -> None:
     from ..appearances.vgg import download_vgg19
     from ..devices import choose_device
     from ..errors import InputError
+    from ..textures.library import shipped_textures_folder
 
     paper = args.preset == "paper"
     method = "image" if paper else args.method
@@ -98,8 +99,9 @@ def _synthesize(args, case, textures, progress) -> None:
         weights = download_vgg19(Path.home() / ".cache" / "expected-appearances")
     if not textures:
         raise InputError(f"{args.textures}: no texture is left after --exclude; leave fewer out.")
-    # Where a panel finds them again; '' for those that ship.
-    case.record("synthesize", textures_folder=str(args.textures.absolute()) if args.textures else "")
+    # Where a panel finds them again; '' for those that ship, which a panel names too and nobody may add to.
+    own = args.textures and args.textures.resolve() != shipped_textures_folder().resolve()
+    case.record("synthesize", textures_folder=str(args.textures.absolute()) if own else "")
     distances = synthesize_case(
         case,
         textures,
