@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.case.recorded import CaseReader, training_state
 from ExpectedAppearancesLib.case.steps import (
@@ -141,6 +142,7 @@ STEEPER = {**POSES, "ranges": RANGES | {"tilt_max_deg": 60.0}}
         (lambda c, r: (replace(c, textures={}, textures_problem="gone"), r), "appearances", DONE, "6"),
         (lambda c, r: (replace(c, synthesis={"size_px": 256}), r), "appearances", STALE, "size"),
         (lambda c, r: (c, replace(r, overview_changed=True)), "appearances", STALE, "craniotomy"),
+        (lambda c, r: (c, replace(r, poses_changed=True)), "appearances", STALE, "the poses"),
         (lambda c, r: (c, replace(r, index=None)), "appearances", READY, "start"),
         (lambda c, r: (c, replace(r, index=index(done=False))), "appearances", READY, "goes on"),
         (lambda c, r: (c, without(r, "render")), "appearances", MISSING, "label maps"),
@@ -270,6 +272,16 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     (case.folder / "vessels.vtp").write_text("other")
     files.write_json(case.folder / "case.json", json.loads((case.folder / "case.json").read_text()) | {"created": ""})
     assert "SHA-256" in reader.recorded(folder, "surface", Limits()).problem
+
+
+def test_appearances_of_each_pose_are_outdated_when_the_poses_are_others(case):
+    reader = CaseReader()
+    files.write_json(case.poses_path, {"frames": [1]})
+    for settings in ({}, {"poses_sha256": files.sha256(case.poses_path)}):  # older versions did not say
+        store.write_index(case, "image", case.camera, settings, [], done=True)
+        assert not reader.recorded(str(case.folder), "image", Limits()).poses_changed
+    files.write_json(case.poses_path, {"frames": [1, 2]})
+    assert reader.recorded(str(case.folder), "image", Limits()).poses_changed
 
 
 def test_training_state_is_read_without_torch(tmp_path):

@@ -57,6 +57,7 @@ class CaseReader:
             "stale" if stale else "known" if rows else "",
             verdict(rows, limits) if rows else None,
             self._study(case),
+            self._poses_changed(case, index) if method == "image" and index else False,
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:
@@ -104,6 +105,10 @@ class CaseReader:
         if (self._once(case.folder / "runs" / "study.json", _read_object) or {}).get("outcome") in STOPPED:
             return Study.STOPPED
         return Study.DONE if (case.folder / "study" / "study.json").is_file() else Study.NONE
+
+    def _poses_changed(self, case: Case, index: dict) -> bool:
+        made_from = index["settings"].get("poses_sha256")
+        return made_from is not None and made_from != self._once(case.poses_path, files.sha256)
 
     def _overview_changed(self, case: Case, index: dict, index_sha256: str) -> bool:
         craniotomy = case.manifest["stages"].get("render", {}).get("craniotomy")

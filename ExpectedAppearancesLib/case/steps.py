@@ -81,9 +81,9 @@ class Chosen:
 class Recorded:
     """What the case folder holds: case.json, the camera, the index of the appearances, model.json; None where absent.
 
-    overview_changed: the view that method `surface` synthesises on is another one now. appearances_sha256: of the
-    index. steps_trained: of a training that was stopped, 0 where there is none. validation: whether figures are
-    there, verdict of `evaluation.verdict` on them: (ready, reasons).
+    overview_changed: the view that method `surface` synthesises on is another one now. poses_changed: those that method
+    `image` synthesises on are. appearances_sha256: of the index. steps_trained: of a training that was stopped, 0 where
+    there is none. validation: whether figures are there, verdict of `evaluation.verdict` on them: (ready, reasons).
     """
 
     problem: str = ""
@@ -97,6 +97,7 @@ class Recorded:
     validation: str = ""
     verdict: tuple[bool, tuple[str, ...]] | None = None
     study: Study = Study.NONE
+    poses_changed: bool = False
 
 
 def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
@@ -246,6 +247,8 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
             changed.append(name)
     if recorded.overview_changed:
         changed.append("the craniotomy")
+    if recorded.poses_changed:
+        changed.append("the poses")
     if index["done"] and not chosen.textures_problem:  # of what cannot be read nobody knows whether it changed
         textures = changes_of_textures(chosen.textures, index)
         changed += textures if len(textures) <= 2 else ["the textures"]
