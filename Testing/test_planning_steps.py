@@ -274,6 +274,15 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     assert "SHA-256" in reader.recorded(folder, "surface", Limits()).problem
 
 
+def test_a_case_is_whole_again_when_its_file_is_restored(case):
+    reader, folder = CaseReader(), str(case.folder)
+    vessels = case.folder / "vessels.vtp"
+    vessels.rename(case.folder / "elsewhere.vtp")
+    assert "restore it" in reader.case(folder)[1]
+    (case.folder / "elsewhere.vtp").rename(vessels)
+    assert reader.case(folder)[1] == ""
+
+
 def test_appearances_of_each_pose_are_outdated_when_the_poses_are_others(case):
     reader = CaseReader()
     files.write_json(case.poses_path, {"frames": [1]})

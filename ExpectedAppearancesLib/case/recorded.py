@@ -33,7 +33,10 @@ class CaseReader:
         path = Path(folder) / MANIFEST_NAME
         if not folder or not path.is_file():
             return None, ""
-        return self._once(path, self._open)
+        case, problem = self._once(path, self._open)
+        if problem:  # a file that is restored leaves case.json as it was
+            self._kept.pop((str(path), self._open.__name__), None)
+        return case, problem
 
     def recorded(self, folder: str, method: str, limits: Limits) -> Recorded:
         """All that the steps of the case depend on; `method` is that of the appearances."""
