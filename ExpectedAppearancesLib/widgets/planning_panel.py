@@ -128,6 +128,7 @@ class PlanningPanel:
             return
         if self._followed != self.parameters.casePath:
             self._followed = self.parameters.casePath
+            self.sections["training"].close()  # forgets what the run of the case before has told
             for watch in self.runs.values():
                 watch.follow(self._followed)
         if not self.entered:
@@ -178,6 +179,7 @@ class PlanningPanel:
         """Make `folder` the case; with take_over its models and settings replace what is chosen, a piece at a time."""
         self._timer.stop()
         self._stepper.stop()
+        self._followed = None  # also the same folder may hold another case now
         if take_over:
             self._opening.stop()
             pieces = self._open_in_pieces(folder)

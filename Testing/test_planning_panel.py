@@ -1,0 +1,46 @@
+"""The planning panel with stand-ins for Qt and Slicer: what its sections do with what they are told."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from test_extension import FOLDER, OPEN_THE_PANEL, ROOT
+
+
+def in_the_panel(code: str, *arguments) -> None:
+    """Run `code` in a fresh interpreter in which `panel` is open; what it asserts must hold."""
+    command = [sys.executable, "-c", OPEN_THE_PANEL + code, str(FOLDER), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_what_a_training_told_is_not_shown_for_another_case(tmp_path):
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.runs.state import RunState, RunStatus
+panel.scene.GetNumberOfNodesByClass.return_value = 0
+training, told = panel.sections["training"], RunStatus(RunState.RUNNING, values={"step": 5, "loss": 1.0})
+for folder in ("first", "second", "second"):  # the second one saved anew
+    panel.open_folder(sys.argv[2] + folder)
+    assert training._curve(None) == []
+    training.on_status(told)
+    assert [point["step"] for point in training._curve(None)] == [5]
+""",
+        tmp_path,
+    )
+
+
+def test_a_run_of_the_case_that_was_replaced_is_forgotten(tmp_path):
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.runs.state import RunState, RunStatus
+panel.open_folder(sys.argv[2])
+panel.runs["train"].status = RunStatus(RunState.FAILED, problem="The run was ended by signal 9.")
+panel.refresh()
+assert "signal 9" in panel.sections["training"].controls._label.text
+panel.open_folder(sys.argv[2])
+assert panel.sections["training"].controls._label.text == ""
+""",
+        tmp_path,
+    )
