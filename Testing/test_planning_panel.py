@@ -44,3 +44,22 @@ assert panel.sections["training"].controls._label.text == ""
 """,
         tmp_path,
     )
+
+
+def test_a_photograph_is_kept_in_the_folder_that_it_was_added_to(tmp_path):
+    """Saved an hour later, maybe: the shipped textures, or those of another case, may be chosen by then."""
+    (tmp_path / "own").mkdir()
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.widgets import planning_labelling
+commands = []
+planning_labelling.Child = lambda command, *_: commands.append(command) or MagicMock()
+planning_labelling.labelling.labels_of = lambda nodes: []
+panel.parameters.texturesPath = sys.argv[2]
+panel.sections["textures"].on_add("/photographs/a.png")
+panel.parameters.texturesPath = ""
+panel.sections["textures"].labelling.save()
+assert commands[-1][-2:] == [sys.argv[2], "a"], commands[-1]
+""",
+        tmp_path / "own",
+    )

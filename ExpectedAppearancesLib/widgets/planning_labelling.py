@@ -25,6 +25,7 @@ class Labelling:
         self.panel, self.ui = panel, panel.ui
         self.nodes: dict = {}
         self._name, self._image = "", None
+        self._textures = Path()  # where it will be kept
         self._child: Child | None = None
         self._saving = False
         self._folder: tempfile.TemporaryDirectory | None = None
@@ -50,10 +51,13 @@ class Labelling:
             "{name}: correct the proposed vessels in the Segment Editor, then come back and save."
         ).format(name=self._name)
 
-    def start(self, name: str, photograph: Path) -> None:
-        """Read it and propose labels in a process of its own, then open the Segment Editor on them."""
+    def start(self, name: str, photograph: Path, textures: Path) -> None:
+        """Read it and propose labels in a process of its own, then open the Segment Editor on them.
+
+        textures: folder that it is added to, in which no other texture has this name.
+        """
         self.stop()
-        self._name = name
+        self._name, self._textures = name, textures
         self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
         command, environment = library_command(PHOTOGRAPH_MODULE, "read", str(photograph), self._folder.name)
         self._child = Child(command, self._proposed, environment)
@@ -90,10 +94,10 @@ class Labelling:
         slicer.util.setSliceViewerLayers(background=self.nodes["colour"], foreground=None, label=None, fit=True)
 
     def save(self) -> None:
-        """Write NAME.png and NAME.labels.png into the textures folder in a process of its own, or say why not."""
+        """Write NAME.png and NAME.labels.png into their folder in a process of its own, or say why not."""
         np.save(Path(self._folder.name) / LABELS, labelling.labels_of(self.nodes))
-        folder = self.panel.session.textures_folder(self.panel.parameters)
-        command, environment = library_command(PHOTOGRAPH_MODULE, "keep", self._folder.name, str(folder), self._name)
+        kept = (self._folder.name, str(self._textures), self._name)
+        command, environment = library_command(PHOTOGRAPH_MODULE, "keep", *kept)
         self._child, self._saving = Child(command, self._saved, environment), True
         self.panel.refresh_soon()
 

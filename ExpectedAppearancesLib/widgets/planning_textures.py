@@ -143,12 +143,13 @@ class TexturesSection(Section):
             )
         if not path or not self._own_folder():
             return
-        taken = list_textures(self.session.textures_folder(self.parameters))
+        folder = self.session.textures_folder(self.parameters)
+        taken = list_textures(folder)
         name = stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in Path(path).stem) or "photograph"
         number = 2
         while name in taken:
             name, number = f"{stem}-{number}", number + 1
-        self.labelling.start(name, Path(path))
+        self.labelling.start(name, Path(path), folder)
 
     def _own_folder(self) -> bool:
         """A folder that photographs can be added to: the chosen one, else one in the case with the shipped textures."""
