@@ -63,3 +63,20 @@ assert commands[-1][-2:] == [sys.argv[2], "a"], commands[-1]
 """,
         tmp_path / "own",
     )
+
+
+def test_a_photograph_never_takes_the_name_of_another_file(tmp_path):
+    for name in ("Foto 1.png", "Foto_1.jpg", "b.png", "b.tif"):
+        (tmp_path / name).touch()
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.widgets import planning_labelling
+planning_labelling.Child = MagicMock()
+textures = panel.sections["textures"]
+panel.parameters.texturesPath = sys.argv[2]
+for photograph, name in (("foto_1", "foto_1-2"), ("b", "b-2"), ("labels", "labels-2"), ("c", "c")):
+    textures.on_add(f"/photographs/{photograph}.png")
+    assert textures.labelling._name == name, textures.labelling._name
+""",
+        tmp_path,
+    )

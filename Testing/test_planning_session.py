@@ -153,6 +153,15 @@ def test_textures_are_compared_with_what_was_synthesised(planned, tmp_path):
     assert session.textures_folder(parameters()) == shipped_textures_folder()
 
 
+def test_two_pictures_of_one_name_are_told_and_the_others_listed(planned, tmp_path):
+    session, p = planned
+    for name in ("a.png", "a.jpg", "b.png"):
+        (tmp_path / name).touch()
+    p.texturesPath = str(tmp_path)
+    assert list(session.texture_files(p)) == ["a", "b"]
+    assert "another texture is called a too" in session.steps(p)["textures"].text
+
+
 def test_a_case_is_opened_with_the_textures_it_was_made_with(scene, planned, tmp_path):
     session, p = planned
     p.casePath, own = str(tmp_path / "case"), tmp_path / "Meine Fotos"

@@ -109,12 +109,14 @@ def list_textures(folder: Path) -> dict[str, tuple[Path, Path | None]]:
     For panels, which show what is there before all of it is right.
     """
     folder = Path(folder)
-    try:
-        images = _image_paths(folder)
-    except InputError:
-        return {}
+    images = _named_images(folder)[0] if folder.is_dir() else {}
     labels = ((name, (folder / f"{name}{LABELS_SUFFIX}", folder / SHARED_LABELS)) for name in images)
     return {name: (images[name], next((path for path in paths if path.is_file()), None)) for name, paths in labels}
+
+
+def names_taken_twice(folder: Path) -> list[str]:
+    """Problems of a folder in which two images would be the same texture, such as a.png and a.jpg."""
+    return _named_images(Path(folder))[1]
 
 
 def read_texture(name: str, image_path: Path, labels_path: Path | None) -> Texture:
@@ -161,19 +163,27 @@ def check_texture(path: Path, image: np.ndarray, labels_path: Path, labels: np.n
 def _image_paths(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         raise InputError(f"{folder}: textures folder not found; check the path.")
+    images, problems = _named_images(folder)
+    if problems:
+        raise InputError(problems)
+    if not images:
+        raise InputError(f"{folder}: holds no textures; put NAME.png with NAME{LABELS_SUFFIX} there.")
+    return images
+
+
+def _named_images(folder: Path) -> tuple[dict[str, Path], list[str]]:
+    """Images by name, the last one where several have it, and which these are."""
     images: dict[str, Path] = {}
-    problems = Problems()
+    problems = []
     for path in sorted(folder.iterdir()):
         is_labels = path.name.lower() == SHARED_LABELS or path.name.lower().endswith(LABELS_SUFFIX)
         if path.suffix.lower() not in IMAGE_SUFFIXES or is_labels or path.name.startswith("."):
             continue
         if path.stem in images:
-            problems.add(f"{path}: another texture is called {path.stem} too ({images[path.stem].name}); rename one.")
+            problems.append(
+                f"{path}: another texture is called {path.stem} too ({images[path.stem].name}); rename one."
+            )
         images[path.stem] = path
-    problems.raise_if_any()
-    if not images:
-        raise InputError(f"{folder}: holds no textures; put NAME.png with NAME{LABELS_SUFFIX} there.")
     # Natural order, so that texture 10 follows 9.
-    return dict(
-        sorted(images.items(), key=lambda item: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", item[0])])
-    )
+    names = sorted(images, key=lambda name: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", name)])
+    return {name: images[name] for name in names}, problems

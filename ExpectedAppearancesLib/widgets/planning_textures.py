@@ -144,10 +144,11 @@ class TexturesSection(Section):
         if not path or not self._own_folder():
             return
         folder = self.session.textures_folder(self.parameters)
-        taken = list_textures(folder)
+        # Windows and macOS do not tell A from a; labels.png would be the label map of all textures that have none.
+        taken = {name.lower() for name in list_textures(folder)} | {"labels"}
         name = stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in Path(path).stem) or "photograph"
         number = 2
-        while name in taken:
+        while name.lower() in taken:
             name, number = f"{stem}-{number}", number + 1
         self.labelling.start(name, Path(path), folder)
 
