@@ -80,3 +80,32 @@ for photograph, name in (("foto_1", "foto_1-2"), ("b", "b-2"), ("labels", "label
 """,
         tmp_path,
     )
+
+
+def test_textures_that_cannot_be_written_are_told(tmp_path):
+    (tmp_path / "a.png").touch()
+    in_the_panel(
+        """
+from pathlib import Path
+from ExpectedAppearancesLib.widgets import planning_textures
+planning_textures.slicer.util = MagicMock()
+told = planning_textures.slicer.util.errorDisplay
+textures = panel.sections["textures"]
+
+def refused(*_arguments, **_named):
+    raise PermissionError(13, "Permission denied")
+
+Path.unlink = planning_textures.copy_shipped_textures.__globals__["shutil"].copyfile = refused
+panel.parameters.texturesPath = sys.argv[2]
+panel.ui.texturesList.selectedItems.return_value = [MagicMock(data=lambda role: "a")]
+textures.on_remove()
+assert "cannot be written" in told.call_args.args[0]
+told.reset_mock()
+panel.parameters.texturesPath = ""
+panel.session.case = lambda p: MagicMock(folder=Path(sys.argv[2]))
+textures.on_add("/photographs/a.png")
+assert "cannot be written" in told.call_args.args[0]
+assert panel.parameters.texturesPath == "" and textures.labelling._name == ""
+""",
+        tmp_path,
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +17,7 @@ from ExpectedAppearancesLib.runs.environment import library_environment
 from ExpectedAppearancesLib.textures import generate, thumbnails
 from ExpectedAppearancesLib.textures.library import (
     Texture,
+    copy_shipped_textures,
     list_textures,
     read_library,
     read_texture,
@@ -187,3 +190,20 @@ def test_thumbnails_and_digests_are_made_by_a_process_of_its_own(tmp_path):
     shown = files.read_image_rgb(made["apricot"]["thumbnail"])
     assert shown.shape == (84, 84, 3) and (shown == thumbnails.OUTLINE_RGB).all(axis=2).any()
     assert "label map" in made["bare"]["problem"] and "x.png" in made["gone"]["problem"]
+
+
+def test_shipped_textures_are_copied_whole_or_not_at_all(tmp_path, monkeypatch):
+    shipped, copied, usual = shipped_textures_folder(), [], shutil.copyfile
+
+    def full_disk(source, target):
+        copied.append(source)
+        if len(copied) == 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        usual(source, target)
+
+    monkeypatch.setattr(shutil, "copyfile", full_disk)
+    with pytest.raises(InputError, match="textures: cannot be written"):
+        copy_shipped_textures(tmp_path / "textures")
+    assert not any(tmp_path.iterdir())
+    copy_shipped_textures(tmp_path / "textures")
+    assert list_textures(tmp_path / "textures").keys() == list_textures(shipped).keys()

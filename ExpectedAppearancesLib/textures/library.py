@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +47,22 @@ class Texture:
 def shipped_textures_folder() -> Path:
     """Folder of the textures that come with the library (made by textures/generate.py)."""
     return Path(__file__).parent / "generated"
+
+
+def copy_shipped_textures(folder: Path) -> None:
+    """Make `folder`, to which photographs can be added, of the textures that ship; whole or not at all.
+
+    Raises InputError where it cannot be written.
+    """
+    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    try:
+        with files.writing(folder):
+            part.mkdir(parents=True)
+            for path in shipped_textures_folder().iterdir():
+                shutil.copyfile(path, part / path.name)  # without its rights: an installed one may be read-only
+            part.rename(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def read_library(folder: Path, exclude: Iterable[str] = ()) -> list[Texture]:

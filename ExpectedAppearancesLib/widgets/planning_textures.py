@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from pathlib import Path
 
@@ -10,8 +9,10 @@ import qt
 import slicer
 from slicer.i18n import tr as _
 
+from .. import files
+from ..errors import InputError
 from ..textures import thumbnails
-from ..textures.library import LABELS_SUFFIX, list_textures, shipped_textures_folder
+from ..textures.library import LABELS_SUFFIX, copy_shipped_textures, list_textures, shipped_textures_folder
 from .planning_case import OWN_TEXTURES
 from .planning_labelling import Labelling
 from .planning_qt import Child, allow, library_command, quiet
@@ -165,7 +166,11 @@ class TexturesSection(Section):
             return False
         folder = case.folder / OWN_TEXTURES
         if not folder.is_dir():
-            shutil.copytree(shipped_textures_folder(), folder)
+            try:
+                copy_shipped_textures(folder)
+            except InputError as error:
+                slicer.util.errorDisplay(str(error))
+                return False
         changed(p, "texturesPath", str(folder))
         return True
 
@@ -181,9 +186,13 @@ class TexturesSection(Section):
             )
         ):
             return
-        for name in names:
-            image, _labels = listed.get(name, (None, None))
-            for path in (image, folder / f"{name}{LABELS_SUFFIX}"):
-                if path is not None:
-                    path.unlink(missing_ok=True)
+        try:
+            with files.writing(folder):
+                for name in names:
+                    image, _labels = listed.get(name, (None, None))
+                    for path in (image, folder / f"{name}{LABELS_SUFFIX}"):
+                        if path is not None:
+                            path.unlink(missing_ok=True)
+        except InputError as error:
+            slicer.util.errorDisplay(str(error))
         self.panel.refresh_soon()
