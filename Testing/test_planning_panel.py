@@ -109,3 +109,68 @@ assert panel.parameters.texturesPath == "" and textures.labelling._name == ""
 """,
         tmp_path,
     )
+
+
+SAVED_ANEW = """
+from pathlib import Path
+from ExpectedAppearancesLib.widgets import planning_case
+told = planning_case.slicer.util = MagicMock()
+section, folder, made = panel.sections["case"], Path(sys.argv[2]), Path(sys.argv[2]).with_name(".case.new")
+
+def save(content):
+    for part in (made, folder / "textures"):
+        part.mkdir(parents=True, exist_ok=True)
+    (folder / "textures" / "a.png").touch()
+    (made / "case.json").write_text(content)
+    section._put_in_place(made, folder)
+
+panel.open_folder(str(folder))
+"""
+
+
+def test_a_case_may_be_saved_anew_twice_within_a_minute(tmp_path):
+    in_the_panel(
+        SAVED_ANEW
+        + """
+planning_case.time.strftime = lambda _format: "2026-01-02 03.04"
+for content in ("1", "2", "3"):
+    save(content)
+kept = sorted(path.name for path in folder.parent.iterdir())
+name = "case until 2026-01-02 03.04"
+assert kept == ["case", name, name + " (2)", name + " (3)"], kept
+assert (folder / "case.json").read_text() == "3" and (folder / "textures" / "a.png").is_file()
+assert (folder.with_name(name + " (3)") / "case.json").read_text() == "2"
+assert not told.errorDisplay.called
+""",
+        tmp_path / "case",
+    )
+
+
+def test_a_case_that_cannot_be_replaced_stays_as_it_was(tmp_path):
+    in_the_panel(
+        SAVED_ANEW
+        + """
+save("1")
+usual, planning_case.shutil.copytree = planning_case.shutil.copytree, MagicMock(side_effect=OSError(28, "disk full"))
+save("2")
+assert "disk full" in told.errorDisplay.call_args.args[0]
+planning_case.shutil.copytree, rename = usual, Path.rename
+Path.rename = lambda path, to: rename(path, to) if path.name != made.name else open(path)  # used by another program
+save("3")
+assert (folder / "case.json").read_text() == "1" and (folder / "textures" / "a.png").is_file()
+assert len(list(folder.parent.iterdir())) == 2, list(folder.parent.iterdir())
+""",
+        tmp_path / "case",
+    )
+
+
+def test_a_case_that_was_opened_while_another_one_was_saved_stays_open(tmp_path):
+    in_the_panel(
+        SAVED_ANEW
+        + """
+panel.open_folder(sys.argv[2] + " of another patient")
+save("1")
+assert panel.parameters.casePath.endswith("patient") and (folder / "case.json").read_text() == "1"
+""",
+        tmp_path / "case",
+    )

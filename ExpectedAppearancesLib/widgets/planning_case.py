@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import tempfile
 import time
@@ -205,12 +206,17 @@ class CaseSection(Section):
     def _put_in_place(self, made: Path, folder: Path) -> None:
         try:
             if made != folder:
+                if (folder / OWN_TEXTURES).is_dir():
+                    shutil.copytree(folder / OWN_TEXTURES, made / OWN_TEXTURES)
                 kept = _kept_name(folder)
                 folder.rename(kept)
-                made.rename(folder)
-                if (kept / OWN_TEXTURES).is_dir():
-                    shutil.copytree(kept / OWN_TEXTURES, folder / OWN_TEXTURES)
+                try:
+                    made.rename(folder)
+                except OSError:
+                    kept.rename(folder)
+                    raise
         except OSError as error:
+            shutil.rmtree(made, ignore_errors=True)
             self._tell(
                 [
                     _("{folder}: could not be replaced ({error}); close what uses it, and save again.").format(
@@ -219,8 +225,9 @@ class CaseSection(Section):
                 ]
             )
             return
-        self.panel.open_folder(str(folder))
-        self._keep_scan()
+        if Path(self.parameters.casePath) == folder:  # else another case was opened meanwhile
+            self.panel.open_folder(str(folder))
+            self._keep_scan()
 
     def _keep_scan(self) -> None:
         """Add the chosen MRI to the case, where it is not in it."""
@@ -296,4 +303,6 @@ def shown_in_slices(volume, fit: bool = False) -> Iterator[None]:
 
 
 def _kept_name(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name} until {time.strftime('%Y-%m-%d %H.%M')}")
+    name = f"{folder.name} until {time.strftime('%Y-%m-%d %H.%M')}"
+    names = itertools.chain([name], (f"{name} ({number})" for number in itertools.count(2)))
+    return next(kept for kept in map(folder.with_name, names) if not kept.exists())
