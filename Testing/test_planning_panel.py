@@ -174,3 +174,20 @@ assert panel.parameters.casePath.endswith("patient") and (folder / "case.json").
 """,
         tmp_path / "case",
     )
+
+
+def test_a_card_of_another_computer_is_not_asked_for():
+    """A scene names the card that was chosen where it was saved; the panel shows Automatic where it is not."""
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.gpus import Gpu
+for card, options, shown in ((1, ["--device", "auto"], 0), (0, ["--device", "cuda"], 2)):
+    panel.sections["training"]._found([Gpu(0, "A", 16.0)])
+    panel.parameters.device = f"cuda:{card}"
+    panel.refresh()
+    assert panel.ui.deviceCombo.currentIndex == shown
+    for name in ("appearances", "training", "validation"):
+        arguments, environment = panel.sections[name].arguments()
+        assert arguments[-2:] == options and bool(environment) is (shown == 2), (name, arguments, environment)
+"""
+    )

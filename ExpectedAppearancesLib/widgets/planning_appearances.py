@@ -67,7 +67,7 @@ class AppearancesSection(Section):
     def arguments(self) -> tuple[list[str], dict[str, str]]:
         """Options of the command `synthesize`, and what its environment needs."""
         p = self.parameters
-        device, environment = device_arguments(p.device)
+        device, environment = device_arguments(self.panel.sections["training"].device)
         options = ["--textures", str(self.session.textures_folder(p)), "--method", p.method.value]
         return [*options, "--size", str(p.sizePx), "--iterations", str(p.iterations), *device], environment
 

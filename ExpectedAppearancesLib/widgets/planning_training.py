@@ -52,9 +52,7 @@ class TrainingSection(Section):
     def refresh(self) -> None:
         p, ui = self.parameters, self.ui
         with quiet(ui.deviceCombo):
-            keys = self._device_keys()
-            # A scene from a computer with another card: auto says what is done then.
-            ui.deviceCombo.currentIndex = keys.index(p.device) if p.device in keys else 0
+            ui.deviceCombo.currentIndex = self._device_keys().index(self.device)
         problem = self.step.text if self.step.state is StepState.MISSING else ""
         before = self.panel.steps["appearances"]
         if before.state is not StepState.DONE:
@@ -66,6 +64,11 @@ class TrainingSection(Section):
             ui.showLossButton, "" if curve else _("Nothing has been trained yet."), _("Show the plot of loss and ADD.")
         )
         self._plot(curve)
+
+    @property
+    def device(self) -> str:
+        """What is chosen; "auto" for a card of the computer that the scene comes from."""
+        return self.parameters.device if self.parameters.device in self._device_keys() else "auto"
 
     def close(self) -> None:
         self._live, self._plotted = [], None
@@ -89,7 +92,7 @@ class TrainingSection(Section):
     def arguments(self) -> tuple[list[str], dict[str, str]]:
         """Options of the command `train`, and what its environment needs."""
         p = self.parameters
-        device, environment = device_arguments(p.device)
+        device, environment = device_arguments(self.device)
         options = ["--preset", p.preset.value, "--minutes", f"{p.minutes:g}", "--appearances", p.method.value]
         return [*options, *device], environment
 

@@ -80,7 +80,7 @@ class ValidationSection(Section):
     def arguments(self) -> tuple[list[str], dict[str, str]]:
         """Options of the command `study`, and what its environment needs: models like the one that is trained."""
         p = self.parameters
-        device, environment = device_arguments(p.device)
+        device, environment = device_arguments(self.panel.sections["training"].device)
         options = ["--protocols", p.studyProtocols.value, "--preset", p.preset.value, "--minutes", f"{p.minutes:g}"]
         return [*options, "--appearances", p.method.value, *device], environment
 
