@@ -191,3 +191,16 @@ for card, options, shown in ((1, ["--device", "auto"], 0), (0, ["--device", "cud
         assert arguments[-2:] == options and bool(environment) is (shown == 2), (name, arguments, environment)
 """
     )
+
+
+def test_placing_a_point_leaves_a_list_of_points_as_it_is():
+    in_the_panel(
+        """
+for points, emptied in ((0, True), (1, True), (3, False)):
+    chosen = panel.parameters.craniotomyNode = MagicMock()
+    chosen.GetNumberOfControlPoints.return_value = points
+    panel.sections["poses"].on_place()
+    assert chosen.RemoveAllControlPoints.called is emptied
+    assert (panel.parameters.craniotomyNode is chosen) is emptied
+"""
+    )

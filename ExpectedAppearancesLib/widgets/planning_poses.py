@@ -144,7 +144,8 @@ class PosesSection(Section):
         """Let the user click a point on the cortex."""
         p = self.parameters
         node = p.craniotomyNode
-        if node is None or not node.IsA("vtkMRMLMarkupsFiducialNode"):
+        # More than one point are a list of the user's own, such as landmarks.
+        if node is None or not node.IsA("vtkMRMLMarkupsFiducialNode") or node.GetNumberOfControlPoints() > 1:
             node = self.panel.scene.AddNewNodeByClass("vtkMRMLMarkupsFiducialNode", _("Craniotomy"))
             node.CreateDefaultDisplayNodes()
             changed(p, "craniotomyNode", node)
