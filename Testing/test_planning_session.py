@@ -124,6 +124,9 @@ def test_a_craniotomy_that_was_marked_is_kept_when_the_case_is_opened(scene, pla
     adopt(session, other, scene)
     assert other.craniotomySource is Where.RECORDED
     assert session.steps(other)["poses"].state is StepState.DONE
+    # Saved anew, as with another microscope, the case has none: a fitted one must not pass for the one that was marked.
+    other.casePath = str(tmp_path / "anew")
+    assert "No craniotomy is saved" in session.steps(other)["poses"].text
 
 
 def test_all_problems_of_a_case_are_told_at_once(planned, tmp_path):

@@ -90,8 +90,10 @@ class PlanningSession:
         """As the panel says: fitted, marked by a point or curve, or as recorded in the case. Raises InputError."""
         vessels, cortex = self._meshes(parameters)
         space, source = self.space(parameters), parameters.craniotomySource.value
-        recorded = self._recorded_craniotomy(parameters)
-        if source == "recorded" and recorded is not None:
+        if source == "recorded":
+            recorded = self._recorded_craniotomy(parameters)
+            if recorded is None:
+                raise InputError("No craniotomy is saved in the case yet: let it be fitted to the models, or mark it.")
             return recorded
         if source == "marked":
             node = parameters.craniotomyNode
