@@ -129,6 +129,17 @@ def test_a_craniotomy_that_was_marked_is_kept_when_the_case_is_opened(scene, pla
     assert "No craniotomy is saved" in session.steps(other)["poses"].text
 
 
+def test_a_craniotomy_marked_on_another_patient_is_not_kept(scene, planned, tmp_path):
+    session, p = planned
+    p.casePath = str(save(session, p, tmp_path).folder)
+    point = scene.AddNewNodeByClass("vtkMRMLMarkupsFiducialNode", "of the case before")
+    point.AddControlPoint(300.0, 0.0, 0.0)
+    p.craniotomySource, p.craniotomyNode = Where.MARKED, point
+    adopt(session, p, scene)
+    assert p.craniotomySource is Where.FITTED
+    np.testing.assert_allclose(session.craniotomy(p).centre_world_mm, session.mesh(p, "vessels").centroid_mm)
+
+
 def test_all_problems_of_a_case_are_told_at_once(planned, tmp_path):
     session, p = planned
     p.calibrationPath = str(tmp_path / "absent.json")

@@ -68,6 +68,8 @@ def _adopt_settings(parameters, case: Case, automatic: PoseRanges) -> None:
     parameters.cameraSource = type(parameters.cameraSource)("file")
     parameters.calibrationPath = str(case.folder / case.manifest["inputs"]["camera"]["file"])
     stages = case.manifest["stages"]
+    # A mark is that of the patient before.
+    parameters.craniotomySource = type(parameters.craniotomySource)("fitted")
     if stages.get("render"):
         _adopt_poses(parameters, stages["render"], automatic)
     synthesize = stages.get("synthesize", {})
