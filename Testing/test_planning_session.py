@@ -52,6 +52,18 @@ def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
         assert scene.GetNumberOfNodesByClass("vtkMRMLModelNode") == count + 2
 
 
+def test_a_case_is_opened_with_its_own_models_and_not_with_those_that_were_changed_since(scene, planned, tmp_path):
+    session, p = planned
+    p.casePath = str(save(session, p, tmp_path).folder)
+    adopt(session, p, scene)
+    opened = p.vesselsNode
+    opened.SetAndObserveTransformNodeID(add_transform(scene, turned()).GetID())
+    p.cortexModel.SetAndObservePolyData(vtk.vtkPolyData())
+    adopt(session, p, scene)
+    assert p.vesselsNode is not opened
+    assert session.steps(p)["case"].state is StepState.DONE
+
+
 def test_models_follow_a_transform_that_is_put_above_theirs_or_taken_away(scene, planned):
     session, p = planned
     outer, parent = add_transform(scene, turned()), p.vesselsNode.GetParentTransformNode()

@@ -10,7 +10,7 @@ from ..case.steps import LENGTH_TOLERANCE_MM
 from ..errors import InputError
 from ..poses.sampling import PoseRanges
 from .mri import scan_of
-from .planning import remove_nodes
+from .planning import remove_nodes, same_mesh, world_mesh
 from .planning_session import PlanningSession
 from .scene import CORTEX, VESSELS, add_case_model
 
@@ -92,7 +92,7 @@ def _models(scene, case: Case, added: list) -> Generator[None, None, dict]:
         entry = case.manifest["inputs"].get(key)
         for i in range(scene.GetNumberOfNodesByClass("vtkMRMLModelNode")):
             node = scene.GetNthNodeByClass(i, "vtkMRMLModelNode")
-            if entry and node.GetAttribute(CASE_ATTRIBUTE) == entry["sha256"]:
+            if entry and node.GetAttribute(CASE_ATTRIBUTE) == entry["sha256"] and _is_as_saved(node, case, key):
                 found[name] = node
         if entry and name not in found:
             found[name] = add_case_model(scene, case, name)
@@ -100,6 +100,13 @@ def _models(scene, case: Case, added: list) -> Generator[None, None, dict]:
             added.append(found[name])
             yield
     return found
+
+
+def _is_as_saved(node, case: Case, key: str) -> bool:
+    """Whether a model that came from the case, or is a copy of one that did, was neither moved nor changed since."""
+    with contextlib.suppress(InputError):
+        return same_mesh(world_mesh(node, space=case.space), getattr(case, key))
+    return False
 
 
 def _adopt_poses(parameters, render: dict, automatic: PoseRanges) -> None:
