@@ -91,6 +91,10 @@ def test_what_has_no_surface_is_refused(scene):
     node.SetAndObservePolyData(line.GetOutput())
     with pytest.raises(InputError, match="no triangles"):
         planning.world_mesh(node)
+    mesh = cases.vessels()
+    mesh.vertices_mm[3, 1] = np.nan
+    with pytest.raises(InputError, match=r"Bad: .* not numbers"):
+        planning.world_mesh(add_model(scene, mesh, "Bad"))
 
 
 def test_craniotomy_from_a_point_and_from_a_curve(scene):

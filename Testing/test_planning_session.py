@@ -64,6 +64,17 @@ def test_a_case_is_opened_with_its_own_models_and_not_with_those_that_were_chang
     assert session.steps(p)["case"].state is StepState.DONE
 
 
+def test_another_cortex_is_a_change_also_where_the_vessels_are_those_of_the_case(scene, planned, tmp_path):
+    session, p = planned
+    p.casePath = str(save(session, p, tmp_path).folder)
+    p.vesselsNode = None  # removed from the scene
+    assert session.changed_models(p) == ()
+    p.cortexModel.SetAndObserveTransformNodeID(None)
+    assert session.changed_models(p) == ("cortex model",)
+    p.cortexModel = None
+    assert session.changed_models(p) == ()
+
+
 def test_models_follow_a_transform_that_is_put_above_theirs_or_taken_away(scene, planned):
     session, p = planned
     outer, parent = add_transform(scene, turned()), p.vesselsNode.GetParentTransformNode()

@@ -46,6 +46,8 @@ def world_mesh(node, segment_id: str = "", space: str = "LPS", surface: Mesh | N
         raise InputError(f"{node.GetName()}: {error}; make the model again.") from error
     if not len(mesh.triangles):
         raise InputError(f"{node.GetName()}: has no triangles; choose a surface, not points or centrelines.")
+    if not np.isfinite(mesh.vertices_mm).all():
+        raise InputError(f"{node.GetName()}: has points whose coordinates are not numbers; make the model again.")
     return mesh if space == "RAS" else _turned(mesh)
 
 

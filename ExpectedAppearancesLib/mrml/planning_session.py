@@ -185,7 +185,7 @@ class PlanningSession:
     def changed_models(self, parameters) -> tuple[str, ...]:
         """Which of the chosen models are no longer those of the case."""
         case = self.case(parameters)
-        if case is None or parameters.vesselsNode is None:
+        if case is None:
             return ()
         changed = []
         for name, title in MODELS.items():
