@@ -122,11 +122,14 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def existing_parent(path: Path) -> Path:
+    """The nearest folder above `path` that is there; the drive itself where Windows does not know it (any more)."""
+    return next((folder for folder in path.parents if folder.exists()), Path(path.anchor))
+
+
 def require_space(folder: Path, needed_mb: float) -> None:
     """Raise InputError when the disk of `folder` (or its nearest existing parent) has less than `needed_mb` free."""
-    folder = Path(folder).absolute()
-    while not folder.exists():
-        folder = folder.parent
+    folder = existing_parent(Path(folder).absolute() / "file")
     free_mb = shutil.disk_usage(folder).free / 2**20
     if free_mb < needed_mb:
         raise InputError(

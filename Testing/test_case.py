@@ -162,6 +162,21 @@ def test_a_folder_that_cannot_be_written(tmp_path, inputs, monkeypatch):
         create(tmp_path / "case", inputs)
 
 
+def test_a_drive_that_is_not_there_is_refused(tmp_path, inputs, monkeypatch):
+    """On Windows even the root of a path may be missing, such as that of a drive that was pulled out."""
+    looked = []
+    monkeypatch.setattr(Path, "is_dir", lambda path: False)
+
+    def is_missing(path):
+        looked.append(path)
+        assert len(looked) < 100, "looks for ever"
+        return False
+
+    monkeypatch.setattr(Path, "exists", is_missing)
+    with pytest.raises(InputError, match="no folder can be made here"):
+        create(tmp_path / "case", inputs)
+
+
 def test_record_on_a_full_disk_keeps_the_manifest(tmp_path, inputs, monkeypatch):
     case = create(tmp_path / "case", inputs)
     before = (tmp_path / "case" / "case.json").read_bytes()

@@ -188,9 +188,7 @@ def _check_new_folder(folder: Path, problems: Problems) -> None:
         return
     if folder.is_dir() and any(folder.iterdir()):
         problems.add(f"{folder}: exists and is not empty; give a new folder, or remove this one first.")
-    parent = folder.parent
-    while not parent.exists():
-        parent = parent.parent
+    parent = files.existing_parent(folder)
     if not parent.is_dir() or not os.access(parent, os.W_OK):
         problems.add(f"{parent}: no folder can be made here; choose a folder you may write to.")
         return

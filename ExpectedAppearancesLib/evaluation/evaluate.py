@@ -99,10 +99,8 @@ def compare(case: Case, camera: Camera, true: list[Frame], predicted: list[Frame
 
 def check_out(folder: Path) -> None:
     """Raise InputError when `folder` cannot be made or written; makes nothing."""
-    existing = folder
-    while not existing.exists():
-        existing = existing.parent
-    if not existing.is_dir():
+    existing = files.existing_parent(folder.absolute() / "file")
+    if existing.is_file():
         raise InputError(f"{existing}: is a file; give --out the name of a folder.")
     if not os.access(existing, os.W_OK):
         raise InputError(f"{existing}: nothing can be written here; choose a folder you may write to.")
