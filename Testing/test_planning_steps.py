@@ -274,6 +274,14 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     assert "SHA-256" in reader.recorded(folder, "surface", Limits()).problem
 
 
+def test_a_case_whose_drive_is_gone_is_told_and_not_taken_for_one_to_be_saved(tmp_path):
+    """A scene that was saved elsewhere: its models are there, its case is not."""
+    recorded = CaseReader().recorded(str(tmp_path / "drive" / "case"), "surface", Limits())
+    for has_vessels in (True, False):
+        step = plan_steps(replace(finished()[0], has_vessels=has_vessels), recorded)["case"]
+        assert step.state is MISSING and "Connect its drive" in step.text
+
+
 def test_a_case_is_whole_again_when_its_file_is_restored(case):
     reader, folder = CaseReader(), str(case.folder)
     vessels = case.folder / "vessels.vtp"

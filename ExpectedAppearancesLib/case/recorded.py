@@ -31,6 +31,8 @@ class CaseReader:
     def case(self, folder: str) -> tuple[Case | None, str]:
         """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
         path = Path(folder) / MANIFEST_NAME
+        if folder and not path.parent.parent.is_dir():  # of a scene from another computer, or on a drive taken away
+            return None, f"{folder}: is not there. Connect its drive, open the case where it is now, or choose New."
         if not folder or not path.is_file():
             return None, ""
         case, problem = self._once(path, self._open)

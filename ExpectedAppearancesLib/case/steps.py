@@ -167,12 +167,12 @@ def changes_of_textures(chosen: dict[str, str], index: dict) -> list[str]:
 def _case(chosen: Chosen, recorded: Recorded) -> Step:
     if chosen.waiting:
         return Step(StepState.RUNNING, chosen.waiting)
+    if recorded.problem:
+        return Step(StepState.MISSING, recorded.problem)
     if not chosen.has_vessels and recorded.manifest is None:
         return Step(StepState.MISSING, "Choose the vessel model, or open a case.")
     if not chosen.folder:
         return Step(StepState.MISSING, "Choose a folder for the case: New or Open.")
-    if recorded.problem:
-        return Step(StepState.MISSING, recorded.problem)
     if recorded.manifest is None:
         if chosen.camera is None:
             return Step(StepState.MISSING, "Give the microscope in the next section, then save the case.")

@@ -67,6 +67,8 @@ class CaseSection(Section):
             reason = _("A run is going on in this case; wait until it has ended, or cancel it.")
         elif not folder:
             reason = _("Choose a folder for the case with New.")
+        elif not Path(folder).parent.is_dir():
+            reason = self.step.text
         elif p.vesselsNode is None and self.session.case(p) is None:
             reason = _("Choose the vessel model first.")
         for button in (self.ui.saveCaseButton, self.ui.saveMicroscopeButton):
