@@ -164,7 +164,10 @@ def test_what_is_missing_or_damaged_is_told(scene, planned, case):
     with pytest.raises(InputError, match=r"mri\.nrrd: the MRI of the case is missing"):
         mri.scan_of(scene, case)
     assert scene.GetNumberOfNodes() == count
-    assert adopt(session, p, scene) is not None and p.mriVolume is None  # the case can be worked on all the same
+    told: list[str] = []
+    # The case can be worked on all the same.
+    assert adopt(session, p, scene, told.append) is not None and p.mriVolume is None
+    assert "mri.nrrd: the MRI of the case is missing" in told[0]
     p.mriVolume = volume(scene)
     assert session.scan_to_keep(p) is not None  # chosen again, it is kept again
 

@@ -91,12 +91,12 @@ def test_a_case_that_is_not_opened_to_the_end_leaves_nothing_in_the_scene(scene,
     p.casePath = str(tmp_path / "case")
     folder = str(save(session, p, tmp_path).folder)
     before, nodes = parameters(), scene.GetNumberOfNodes()
-    assert len(list(adopting(session, parameters(), folder, scene))) > 5
+    assert len(list(adopting(session, parameters(), folder, scene, print))) > 5
     assert scene.GetNumberOfNodes() > nodes
     for done in range(5):
         other, chosen = new_scene(), parameters()
         there = other.GetNumberOfNodes()
-        opening = adopting(session, chosen, folder, other)
+        opening = adopting(session, chosen, folder, other, print)
         for _piece in range(done + 1):
             next(opening)
         opening.close()

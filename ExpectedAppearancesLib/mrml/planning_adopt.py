@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 
 from ..case.case import Case
 from ..case.steps import LENGTH_TOLERANCE_MM
@@ -17,9 +17,9 @@ from .scene import CORTEX, VESSELS, add_case_model
 CASE_ATTRIBUTE = "ExpectedAppearances.CaseInput"
 
 
-def adopt(session: PlanningSession, parameters, scene) -> Case | None:
+def adopt(session: PlanningSession, parameters, scene, warn: Callable[[str], None] = print) -> Case | None:
     """Take the case at parameters.casePath into scene and panel; None where there is none that can be opened."""
-    pieces = adopting(session, parameters, parameters.casePath, scene)
+    pieces = adopting(session, parameters, parameters.casePath, scene, warn)
     while True:
         try:
             next(pieces)
@@ -27,8 +27,13 @@ def adopt(session: PlanningSession, parameters, scene) -> Case | None:
             return stop.value
 
 
-def adopting(session: PlanningSession, parameters, folder: str, scene) -> Generator[None, None, Case | None]:
-    """`adopt` of the case in `folder`, a piece at each step. Closed before its end it leaves nothing in the scene."""
+def adopting(
+    session: PlanningSession, parameters, folder: str, scene, warn: Callable[[str], None]
+) -> Generator[None, None, Case | None]:
+    """`adopt` of the case in `folder`, a piece at each step. Closed before its end it leaves nothing in the scene.
+
+    warn: called with the text, where the case's MRI is missing or damaged.
+    """
     case = session.reader.case(folder)[0]
     yield
     if case is None:
@@ -43,10 +48,12 @@ def adopting(session: PlanningSession, parameters, folder: str, scene) -> Genera
             yield
         nodes = yield from _models(scene, case, added)
         scan = None
-        with contextlib.suppress(InputError):  # all else can be worked with; the panel says that the MRI is missing
+        try:
             count = scene.GetNumberOfNodesByClass("vtkMRMLScalarVolumeNode")
             scan = scan_of(scene, case)
             added += [scan] if scene.GetNumberOfNodesByClass("vtkMRMLScalarVolumeNode") > count else []
+        except InputError as error:  # all else can be worked with
+            warn(str(error))
         yield
         automatic = PoseRanges().resolved(case.camera, case.vessels.radius_mm)
         yield

@@ -216,7 +216,7 @@ class PlanningPanel:
 
     def _adopting(self, folder: str) -> Iterator[None]:
         """The panel's widgets take over what they are told and answer to nothing."""
-        pieces = adopting(self.session, self.parameters, folder, self.scene)
+        pieces = adopting(self.session, self.parameters, folder, self.scene, slicer.util.warningDisplay)
         try:
             while True:
                 self.loading = True
