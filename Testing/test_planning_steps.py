@@ -190,6 +190,19 @@ def test_what_rests_on_an_outdated_step_is_outdated():
     assert "the poses" in plan_steps(replace(chosen, poses=STEEPER), recorded)["training"].text
 
 
+def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
+    chosen, recorded = finished()
+    recorded = with_stage(replace(recorded, steps_trained=70), "train", done=False)
+    recorded.manifest["stages"]["train"]["preset"] = {"name": "best", "minutes": 90.0}
+    for preset, minutes, words in (
+        ("best", 90.0, "resume goes on from there"),
+        ("best", 120.0, "the time (was 90 min); so it begins anew"),
+        ("quick", 26.0, "the preset (was best); so it begins anew"),
+    ):
+        step = plan_steps(replace(chosen, preset=preset, minutes=minutes), recorded)["training"]
+        assert step.state is READY and words in step.text
+
+
 def test_older_cases_are_judged_by_time():
     chosen, recorded = finished()
     recorded = with_stage(recorded, "train", appearances_sha256=None)

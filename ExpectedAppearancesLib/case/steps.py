@@ -58,7 +58,7 @@ class Chosen:
     them, None where they cannot be had. textures: name -> SHA-256 of image and labels, "" while it has not been read.
     synthesis: {"size_px", "iterations"}. running: kinds of runs that go on. scan_unsaved: the chosen MRI is not in the
     case, which changes nothing that is made from it. waiting: what is still being worked out of the models, '' if
-    nothing is; what the case says of them is not known so long.
+    nothing is; what the case says of them is not known so long. minutes: longest training, 0 where it is not known.
     """
 
     folder: str = ""
@@ -75,6 +75,7 @@ class Chosen:
     running: frozenset[str] = frozenset()
     scan_unsaved: bool = False
     waiting: str = ""
+    minutes: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -268,7 +269,11 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     train = stages.get("train", {})
     if not train.get("done"):
         if recorded.steps_trained:
-            return Step(StepState.READY, f"Stopped after step {recorded.steps_trained}; resume goes on from there.")
+            stopped = f"Stopped after step {recorded.steps_trained}"
+            changed = _changes_of_training(chosen, train.get("preset", {}))
+            if changed:
+                return Step(StepState.READY, f"{stopped}. Changed since: {_listed(changed)}; so it begins anew.")
+            return Step(StepState.READY, f"{stopped}; resume goes on from there.")
         return Step(StepState.READY, "All is there: start.")
     changed = []
     if _appearances_changed(stages, train, recorded.appearances_sha256):
@@ -283,6 +288,16 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     if changed:
         return Step(StepState.STALE, f"Changed since the training: {_listed(changed)}. Train again.")
     return Step(StepState.DONE, f"Trained with preset {trained}.")
+
+
+def _changes_of_training(chosen: Chosen, preset: dict) -> list[str]:
+    """Of a training that was stopped: with any of these changed its checkpoint is of no use."""
+    changed = []
+    if chosen.preset and preset.get("name") and chosen.preset != preset["name"]:
+        changed.append(f"the preset (was {preset['name']})")
+    elif chosen.minutes and preset.get("minutes") and not _close(chosen.minutes, preset["minutes"], 1e-3):
+        changed.append(f"the time (was {preset['minutes']:g} min)")
+    return changed
 
 
 def _validation(chosen: Chosen, recorded: Recorded) -> Step:

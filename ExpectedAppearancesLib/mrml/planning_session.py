@@ -236,6 +236,7 @@ class PlanningSession:
             running,
             self.scan_to_keep(parameters) is not None,
             self.waiting(parameters),
+            parameters.minutes,
         )
 
     def recorded(self, parameters) -> Recorded:
