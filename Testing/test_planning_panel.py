@@ -204,3 +204,16 @@ for points, emptied in ((0, True), (1, True), (3, False)):
     assert (panel.parameters.craniotomyNode is chosen) is emptied
 """
     )
+
+
+def test_the_verdict_names_the_test_that_it_rests_on():
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.case.recorded import Recorded
+from ExpectedAppearancesLib.evaluation.verdict import OWN_VALIDATION, Figures
+panel.recorded = Recorded(verdict=(True, ()))
+loto, own, strict = (Figures(name, "", *[1.0] * 6) for name in ("loto", OWN_VALIDATION, "strict"))
+for rows, words in (([loto, own], "own validation"), ([strict, loto, own], "unseen texture and pose")):
+    assert words in panel.sections["validation"]._verdict(rows), panel.sections["validation"]._verdict(rows)
+"""
+    )

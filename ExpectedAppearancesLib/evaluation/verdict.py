@@ -67,10 +67,15 @@ def figures_of_model(model: dict) -> list[Figures]:
     return [Figures(OWN_VALIDATION, "", mean, median, None, below, None, values.get("accepted_of_true"))]
 
 
+def deciding(rows: list[Figures]) -> Figures | None:
+    """The row, of all textures, of the strictest protocol there is."""
+    of_all = {row.protocol: row for row in rows if not row.style}
+    return next((of_all[name] for name in ("strict", OWN_VALIDATION, "loto") if name in of_all), None)
+
+
 def verdict(rows: list[Figures], limits: Limits) -> tuple[bool, tuple[str, ...]] | None:
     """(ready, what keeps it from being ready) on the strictest protocol there is; None without figures."""
-    of_all = {row.protocol: row for row in rows if not row.style}
-    row = next((of_all[name] for name in ("strict", OWN_VALIDATION, "loto") if name in of_all), None)
+    row = deciding(rows)
     if row is None:
         return None
     accuracy_name = "of views with ADD below 3 mm" if row.protocol == OWN_VALIDATION else "within 3 mm and 3°"

@@ -8,7 +8,7 @@ import slicer
 from slicer.i18n import tr as _
 
 from ..case.steps import StepState, Study
-from ..evaluation.verdict import PROTOCOL_NAMES
+from ..evaluation.verdict import PROTOCOL_NAMES, deciding
 from ..gpus import device_arguments
 from ..mrml import charts
 from .labels import set_text
@@ -114,7 +114,7 @@ class ValidationSection(Section):
 
     def _verdict(self, rows: list) -> str:
         ready, reasons = self.panel.recorded.verdict
-        shown = next(row for row in rows if not row.style)
+        shown = deciding(rows)
         head = _("Ready") if ready else _("Not ready")
         colour = READY_COLOUR if ready else NOT_READY_COLOUR
         lines = [f'<b style="color:{colour}">{head}</b>']
