@@ -217,3 +217,20 @@ for rows, words in (([loto, own], "own validation"), ([strict, loto, own], "unse
     assert words in panel.sections["validation"]._verdict(rows), panel.sections["validation"]._verdict(rows)
 """
     )
+
+
+def test_helpers_open_no_window_on_windows():
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.runs import system_report, worker
+from ExpectedAppearancesLib.widgets import planning_qt
+for module in (planning_qt, system_report, worker):
+    module.WITHOUT_WINDOW = {"creationflags": 134217728}
+    module.subprocess = MagicMock()
+planning_qt.Child(["nvidia-smi"], print)
+system_report.SystemCheck()
+worker.Worker("surfaces").ask({})
+for module in (planning_qt, system_report, worker):
+    assert module.subprocess.Popen.call_args.kwargs["creationflags"] == 134217728, module
+"""
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from .processes import MARK_VARIABLE
 LIBRARY_PARENT = Path(__file__).resolve().parents[2]
 # Kinds of runs that are command-line modules of 3D Slicer; any other command runs through the library itself.
 MODULES = {"synthesize": "ExpectedAppearancesSynthesis", "train": "ExpectedAppearancesTraining"}
+
+# For Popen: on Windows a program of the terminal opens a black window, else, wherever a panel starts it.
+WITHOUT_WINDOW = {"creationflags": subprocess.CREATE_NO_WINDOW} if os.name == "nt" else {}
 
 
 def python_for_runs(executable: str | None = None) -> str:

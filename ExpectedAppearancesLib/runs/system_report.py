@@ -9,7 +9,7 @@ import tempfile
 
 from ..cli import check
 from . import dependencies
-from .environment import environment_of, python_for_runs
+from .environment import WITHOUT_WINDOW, environment_of, python_for_runs
 
 PURPOSES = {"registration": "registering frames", "planning": "planning", "training": "synthesis and training"}
 
@@ -20,14 +20,13 @@ class SystemCheck:
     def __init__(self) -> None:
         self._report: dict | None = None
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 (closed once it is read)
-        quiet = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
         self._process = subprocess.Popen(
             [python_for_runs(), "-m", "ExpectedAppearancesLib", "check", "--json"],
             stdin=subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.DEVNULL,
             env=environment_of("check"),
-            **quiet,
+            **WITHOUT_WINDOW,
         )
 
     def poll(self) -> dict | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError
-from .environment import environment_of, python_for_runs
+from .environment import WITHOUT_WINDOW, environment_of, python_for_runs
 
 # Module and function whose result answers the questions of a task, a function of one dict; loaded in the process alone.
 TASKS = {
@@ -107,7 +107,6 @@ class Worker:
             self._process.stdin.flush()
 
     def _start(self) -> None:
-        quiet = {"creationflags": subprocess.CREATE_NO_WINDOW} if os.name == "nt" else {}
         self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
         path = Path(self._folder.name) / "answers.txt"
         with open(path, "wb") as stream:
@@ -117,7 +116,7 @@ class Worker:
                 stdout=stream,
                 stderr=subprocess.DEVNULL,
                 env=environment_of("helper"),
-                **quiet,
+                **WITHOUT_WINDOW,
             )
         self._answers = open(path, "rb")  # noqa: SIM115 (closed in stop)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import qt
 
 from ..case.steps import Step, StepState
+from ..runs.environment import WITHOUT_WINDOW, environment_of, python_for_runs
 from ..runs.worker import Worker
 from .labels import set_text
 
@@ -161,7 +162,12 @@ class Child:
         self._output = Path(self._folder.name) / "output.txt"
         with open(self._output, "wb") as stream:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT, env=environment
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                **WITHOUT_WINDOW,
             )
         self._timer = qt.QTimer()
         self._timer.setInterval(50)
@@ -194,8 +200,6 @@ class Child:
 
 def library_command(*arguments: str) -> tuple[list[str], dict]:
     """Command line and environment of `python -m ARGUMENTS` with the Python that runs are started with."""
-    from ..runs.environment import environment_of, python_for_runs
-
     return [python_for_runs(), "-m", *arguments], environment_of("helper")
 
 
