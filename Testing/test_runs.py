@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -300,6 +301,22 @@ def test_a_run_goes_on_when_the_program_that_started_it_is_killed(case):
     assert run.poll().state is RunState.RUNNING and all(p.is_running() for p in tree)
     run.cancel()
     assert run.wait(DEADLINE_S).state is RunState.CANCELLED
+
+
+def test_a_run_of_a_case_is_not_taken_for_one_of_its_copy_and_follows_it_when_it_is_moved(case):
+    run = start(case, "wait")
+    wait_until_ready(case)
+    copy = case.with_name("copy")
+    shutil.copytree(case, copy)
+    assert Run.find(copy, "synthesize") is None
+    other = start(copy, "done")  # nothing goes on there
+    assert other.wait(DEADLINE_S).state is RunState.DONE
+    assert run.poll().state is RunState.RUNNING
+    shutil.rmtree(copy)
+    case.rename(copy)
+    found = Run.find(copy, "synthesize")
+    found.cancel()
+    assert found.wait(DEADLINE_S).state is RunState.CANCELLED
 
 
 def test_a_later_process_learns_once_that_a_run_has_crashed(case):

@@ -68,7 +68,13 @@ def read_record(case_folder: Path, kind: str) -> RunRecord | None:
         return None
     if not isinstance(record.pid, int) or not isinstance(record.mark, str) or not record.mark:
         return None
-    return record if record.host == platform.node() else None
+    return record if record.host == platform.node() and not _is_of_another_case(record, case_folder) else None
+
+
+def _is_of_another_case(record: RunRecord, case_folder: Path) -> bool:
+    """Whether the run works on another folder, of which this one is a copy; not where that was moved to here."""
+    worked_on = [Path(word) for word in record.command if (Path(word) / "case.json").is_file()]
+    return bool(worked_on) and not any(os.path.samefile(folder, case_folder) for folder in worked_on)
 
 
 def write_record(case_folder: Path, record: RunRecord) -> None:
