@@ -234,3 +234,18 @@ for module in (planning_qt, system_report, worker):
     assert module.subprocess.Popen.call_args.kwargs["creationflags"] == 134217728, module
 """
     )
+
+
+def test_the_shipped_textures_are_known_however_their_path_is_written(tmp_path):
+    """Qt writes paths with other slashes than Windows; taken for the user's own they could be deleted."""
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.textures.library import shipped_textures_folder
+shipped = str(shipped_textures_folder())
+for path, chosen in ((shipped + "/", ""), (sys.argv[2], sys.argv[2]), (shipped + "/../generated", ""), ("", "")):
+    panel.ui.texturesPathEdit.currentPath = path
+    panel.sections["textures"].on_path()
+    assert panel.parameters.texturesPath == chosen, path
+""",
+        tmp_path,
+    )

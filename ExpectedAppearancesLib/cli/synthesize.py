@@ -90,7 +90,7 @@ def _synthesize(args, case, textures, progress) -> None:
     from ..appearances.vgg import download_vgg19
     from ..devices import choose_device
     from ..errors import InputError
-    from ..textures.library import shipped_textures_folder
+    from ..textures.library import is_shipped
 
     paper = args.preset == "paper"
     method = "image" if paper else args.method
@@ -100,7 +100,7 @@ def _synthesize(args, case, textures, progress) -> None:
     if not textures:
         raise InputError(f"{args.textures}: no texture is left after --exclude; leave fewer out.")
     # Where a panel finds them again; '' for those that ship, which a panel names too and nobody may add to.
-    own = args.textures and args.textures.resolve() != shipped_textures_folder().resolve()
+    own = args.textures and not is_shipped(args.textures)
     case.record("synthesize", textures_folder=str(args.textures.absolute()) if own else "")
     distances = synthesize_case(
         case,

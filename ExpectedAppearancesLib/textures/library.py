@@ -49,6 +49,11 @@ def shipped_textures_folder() -> Path:
     return Path(__file__).parent / "generated"
 
 
+def is_shipped(folder: Path) -> bool:
+    """Whether these are the textures that ship, by whatever path they are named."""
+    return Path(folder).resolve() == shipped_textures_folder().resolve()
+
+
 def copy_shipped_textures(folder: Path) -> None:
     """Make `folder`, to which photographs can be added, of the textures that ship; whole or not at all.
 

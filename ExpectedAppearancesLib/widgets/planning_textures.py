@@ -12,7 +12,13 @@ from slicer.i18n import tr as _
 from .. import files
 from ..errors import InputError
 from ..textures import thumbnails
-from ..textures.library import LABELS_SUFFIX, copy_shipped_textures, list_textures, shipped_textures_folder
+from ..textures.library import (
+    LABELS_SUFFIX,
+    copy_shipped_textures,
+    is_shipped,
+    list_textures,
+    shipped_textures_folder,
+)
 from .planning_case import OWN_TEXTURES
 from .planning_labelling import Labelling
 from .planning_qt import Child, allow, library_command, quiet
@@ -128,7 +134,7 @@ class TexturesSection(Section):
 
     def on_path(self, _path=None) -> None:
         path = self.ui.texturesPathEdit.currentPath
-        changed(self.parameters, "texturesPath", "" if path == str(shipped_textures_folder()) else path)
+        changed(self.parameters, "texturesPath", "" if not path or is_shipped(path) else path)
 
     def on_shipped(self) -> None:
         changed(self.parameters, "texturesPath", "")
