@@ -295,6 +295,16 @@ def test_a_case_whose_drive_is_gone_is_told_and_not_taken_for_one_to_be_saved(tm
         assert step.state is MISSING and "Connect its drive" in step.text
 
 
+def test_a_case_that_is_moved_while_it_is_open_is_told(case):
+    reader, folder = CaseReader(), case.folder
+    assert reader.case(str(folder))[0]
+    folder.rename(folder.with_name("elsewhere"))
+    assert "open the case where it is now" in reader.case(str(folder))[1]
+    assert reader.case(str(folder.with_name("new"))) == (None, "")
+    folder.with_name("elsewhere").rename(folder)
+    assert reader.case(str(folder))[0]
+
+
 def test_a_case_is_whole_again_when_its_file_is_restored(case):
     reader, folder = CaseReader(), str(case.folder)
     vessels = case.folder / "vessels.vtp"

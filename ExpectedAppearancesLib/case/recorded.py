@@ -31,10 +31,11 @@ class CaseReader:
     def case(self, folder: str) -> tuple[Case | None, str]:
         """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
         path = Path(folder) / MANIFEST_NAME
-        if folder and not path.parent.parent.is_dir():  # of a scene from another computer, or on a drive taken away
-            return None, f"{folder}: is not there. Connect its drive, open the case where it is now, or choose New."
         if not folder or not path.is_file():
-            return None, ""
+            # A scene from another computer, a drive taken away, or a case that was here a moment ago.
+            gone = folder and (not path.parent.parent.is_dir() or (self._case and self._case.folder == path.parent))
+            text = f"{folder}: is not there. Connect its drive, open the case where it is now, or choose New."
+            return None, text if gone else ""
         case, problem = self._once(path, self._open)
         if problem:  # a file that is restored leaves case.json as it was
             self._kept.pop((str(path), self._open.__name__), None)
