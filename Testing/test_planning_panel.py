@@ -249,3 +249,16 @@ for path, chosen in ((shipped + "/", ""), (sys.argv[2], sys.argv[2]), (shipped +
 """,
         tmp_path,
     )
+
+
+def test_a_mark_that_is_moved_by_its_transform_is_followed():
+    """Slicer tells of that by another event than of a point that is dragged."""
+    in_the_panel(
+        """
+mark = panel.parameters.craniotomyNode = MagicMock()
+panel.parameters.craniotomySource = module.CraniotomySource.MARKED
+panel.refresh()
+events = [call.args[0] for call in mark.AddObserver.call_args_list]
+assert mark.TransformModifiedEvent in events and mark.PointModifiedEvent in events
+"""
+    )

@@ -48,7 +48,8 @@ class PosesSection(Section):
         with quiet(ui.craniotomySelector):
             ui.craniotomySelector.setCurrentNode(p.craniotomyNode)
         node = p.craniotomyNode if marked else None
-        self._watch.watch(node, *((node.PointModifiedEvent, node.PointRemovedEvent) if node else ()))
+        events = (node.PointModifiedEvent, node.PointRemovedEvent, node.TransformModifiedEvent) if node else ()
+        self._watch.watch(node, *events)
         for box in (ui.nearestSlider, ui.farthestSlider):
             allow(box, _("Taken from the field of view; untick to set it.") if p.distanceAuto else "", "")
         reason = _("A quarter of the vessels' radius; untick to set it.") if p.lateralAuto else ""
