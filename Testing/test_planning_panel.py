@@ -262,3 +262,19 @@ events = [call.args[0] for call in mark.AddObserver.call_args_list]
 assert mark.TransformModifiedEvent in events and mark.PointModifiedEvent in events
 """
     )
+
+
+def test_a_study_that_would_begin_anew_says_so():
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.case.recorded import Recorded
+from ExpectedAppearancesLib.case.steps import Study
+validation, p = panel.sections["validation"], panel.parameters
+panel.recorded = Recorded(study=Study.STOPPED, study_preset={"name": p.preset.value, "minutes": p.minutes})
+validation._show_hint(2)
+assert "begins anew" not in panel.ui.studyHint.text and "Trains 4 models" in panel.ui.studyHint.text
+p.minutes *= 2
+validation._show_hint(2)
+assert "begins anew" in panel.ui.studyHint.text
+"""
+    )

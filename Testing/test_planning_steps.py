@@ -203,6 +203,17 @@ def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
         assert step.state is READY and words in step.text
 
 
+def test_a_stopped_study_begins_anew_with_other_settings_and_says_so(case):
+    reader, folder = CaseReader(), str(case.folder)
+    chosen = replace(finished()[0], preset="quick", minutes=26.0)
+    command = ["python", "-m", "study", folder, "--protocols", "strict", "--preset", "quick", "--minutes"]
+    for minutes, words in (("26", "goes on where it was"), ("90.5", "the time (was 90.5 min); so it begins anew")):
+        record = {"outcome": "cancelled", "command": [*command, minutes, "--device", "cpu"]}
+        files.write_json(case.folder / "runs" / "study.json", record)
+        step = plan_steps(chosen, reader.recorded(folder, "surface", Limits()))["validation"]
+        assert step.state is READY and words in step.text
+
+
 def test_older_cases_are_judged_by_time():
     chosen, recorded = finished()
     recorded = with_stage(recorded, "train", appearances_sha256=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 from collections.abc import Callable
@@ -64,6 +65,7 @@ class CaseReader:
             verdict(rows, limits) if rows else None,
             self._study(case),
             self._poses_changed(case, index) if method == "image" and index else False,
+            self._study_preset(case),
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:
@@ -111,6 +113,13 @@ class CaseReader:
         if (self._once(case.folder / "runs" / "study.json", _read_object) or {}).get("outcome") in STOPPED:
             return Study.STOPPED
         return Study.DONE if (case.folder / "study" / "study.json").is_file() else Study.NONE
+
+    def _study_preset(self, case: Case) -> dict:
+        words = (self._once(case.folder / "runs" / "study.json", _read_object) or {}).get("command") or []
+        with contextlib.suppress(ValueError):  # one of them was left out
+            name, minutes = (words[words.index(option) + 1] for option in ("--preset", "--minutes"))
+            return {"name": name, "minutes": float(minutes)}
+        return {}
 
     def _poses_changed(self, case: Case, index: dict) -> bool:
         made_from = index["settings"].get("poses_sha256")

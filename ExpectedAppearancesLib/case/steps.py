@@ -85,6 +85,7 @@ class Recorded:
     overview_changed: the view that method `surface` synthesises on is another one now. poses_changed: those that method
     `image` synthesises on are. appearances_sha256: of the index. steps_trained: of a training that was stopped, 0 where
     there is none. validation: whether figures are there, verdict of `evaluation.verdict` on them: (ready, reasons).
+    study_preset: {"name", "minutes"} of the last study's models, as far as its run was told.
     """
 
     problem: str = ""
@@ -99,6 +100,7 @@ class Recorded:
     verdict: tuple[bool, tuple[str, ...]] | None = None
     study: Study = Study.NONE
     poses_changed: bool = False
+    study_preset: dict = field(default_factory=dict)
 
 
 def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
@@ -163,6 +165,15 @@ def changes_of_textures(chosen: dict[str, str], index: dict) -> list[str]:
     changes += [f"{name} was removed" for name in made if name not in chosen]
     # Without a digest, of one that is not read yet or in a case of an older version, nothing can be said.
     return changes + [f"{n} was changed" for n in made if made[n] and chosen.get(n) and chosen[n] != made[n]]
+
+
+def changes_of_training(preset: str, minutes: float, before: dict) -> list[str]:
+    """What differs from the {"name", "minutes"} with which a training or study was stopped: all of it begins anew."""
+    if preset and before.get("name") and preset != before["name"]:
+        return [f"the preset (was {before['name']})"]
+    if minutes and before.get("minutes") and not _close(minutes, before["minutes"], 1e-3):
+        return [f"the time (was {before['minutes']:g} min)"]
+    return []
 
 
 def _case(chosen: Chosen, recorded: Recorded) -> Step:
@@ -270,7 +281,7 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     if not train.get("done"):
         if recorded.steps_trained:
             stopped = f"Stopped after step {recorded.steps_trained}"
-            changed = _changes_of_training(chosen, train.get("preset", {}))
+            changed = changes_of_training(chosen.preset, chosen.minutes, train.get("preset", {}))
             if changed:
                 return Step(StepState.READY, f"{stopped}. Changed since: {_listed(changed)}; so it begins anew.")
             return Step(StepState.READY, f"{stopped}; resume goes on from there.")
@@ -290,21 +301,16 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     return Step(StepState.DONE, f"Trained with preset {trained}.")
 
 
-def _changes_of_training(chosen: Chosen, preset: dict) -> list[str]:
-    """Of a training that was stopped: with any of these changed its checkpoint is of no use."""
-    changed = []
-    if chosen.preset and preset.get("name") and chosen.preset != preset["name"]:
-        changed.append(f"the preset (was {preset['name']})")
-    elif chosen.minutes and preset.get("minutes") and not _close(chosen.minutes, preset["minutes"], 1e-3):
-        changed.append(f"the time (was {preset['minutes']:g} min)")
-    return changed
-
-
 def _validation(chosen: Chosen, recorded: Recorded) -> Step:
     if "study" in chosen.running:
         return Step(StepState.RUNNING, "A study is going on: for each texture a model is trained without it.")
     if recorded.verdict is None:
         if recorded.study is Study.STOPPED:
+            changed = changes_of_training(chosen.preset, chosen.minutes, recorded.study_preset)
+            if changed:
+                return Step(
+                    StepState.READY, f"The study was stopped. Changed since: {_listed(changed)}; so it begins anew."
+                )
             return Step(StepState.READY, "The study was stopped; it goes on where it was.")
         if recorded.model is not None:
             return Step(StepState.MISSING, "No figures yet.")

@@ -7,7 +7,7 @@ import html
 import slicer
 from slicer.i18n import tr as _
 
-from ..case.steps import StepState, Study
+from ..case.steps import StepState, Study, changes_of_training
 from ..evaluation.verdict import PROTOCOL_NAMES, deciding
 from ..gpus import device_arguments
 from ..mrml import charts
@@ -101,6 +101,9 @@ class ValidationSection(Section):
         text = _(
             "Trains {models} models as set above: {time} of training, and some minutes more to test each of them."
         ).format(models=models, time=_duration(models * p.minutes))
+        recorded = self.panel.recorded
+        if recorded.study is Study.STOPPED and changes_of_training(p.preset.value, p.minutes, recorded.study_preset):
+            text += " " + _("The study that was stopped had other settings: it begins anew, its models are not used.")
         set_text(self.ui.studyHint, text if models else "")
 
     def _fill(self, rows: list) -> tuple:
