@@ -152,7 +152,7 @@ class ExpectedAppearancesParameterNode:
 
     method: Method = Method.SURFACE
     sizePx: Annotated[int, WithinRange(32, 2048)] = 384
-    iterations: Annotated[int, WithinRange(1, 1000)] = 40
+    iterations: Annotated[int, WithinRange(1, 1000)] = 28
 
     preset: TrainingPreset = TrainingPreset.QUICK
     device: str = "auto"  # or "cpu", or "cuda:N"

@@ -211,6 +211,23 @@ def test_panel_names_parameters_that_exist(module):
     assert set(bound) <= parameters, set(bound) - parameters
 
 
+def test_the_planning_panel_begins_with_what_the_commands_do_by_themselves():
+    from ExpectedAppearancesLib.appearances.workload import DEFAULT_ITERATIONS
+    from ExpectedAppearancesLib.cli import _build_parser
+    from ExpectedAppearancesLib.model.presets import PRESETS
+
+    tree = ast.parse(MODULE.read_text(encoding="utf-8"))
+    node = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name.endswith("ParameterNode"))
+    constants = (n for n in node.body if isinstance(n, ast.AnnAssign) and isinstance(n.value, ast.Constant))
+    panel = {n.target.id: n.value.value for n in constants}
+    words = ["synthesize", "CASE"]
+    assert panel["iterations"] == DEFAULT_ITERATIONS == _build_parser(words).parse_args(words).iterations
+    assert panel["minutes"] == PRESETS["quick"].minutes
+    words = ["render", "CASE"]
+    rendered = _build_parser(words).parse_args(words)
+    assert (panel["poseCount"], panel["seed"]) == (rendered.poses, rendered.seed)
+
+
 @every_module
 def test_panel_is_as_wide_whatever_is_unfolded(module):
     """Slicer gives a panel the width that its content needs: without a common minimum the views jump."""
