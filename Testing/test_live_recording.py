@@ -111,6 +111,33 @@ def test_a_loaded_scene_shows_its_last_frame_without_overlay(application, phanto
     assert not LiveController(scene).restore(phantom.case.folder, camera)
 
 
+def test_a_case_chosen_before_the_panel_is_entered_again_takes_the_last_frame_along(
+    application, phantom, model, frames, tmp_path
+):
+    scene, _logic = application
+    node_with(scene, frames[1][3])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    controller.stop()
+    other = make_phantom(tmp_path / "other", seed=1)
+    assert not controller.restore(other.case.folder, controller.camera)
+    assert controller.live.frame is None and controller.tick().verdict.sight is Sight.IDLE
+    controller.close()
+
+
+def test_a_recording_has_its_overlay_again_when_the_panel_is_entered_again(application, phantom, model, frames):
+    scene, _logic = application
+    controller = LiveController(scene)
+    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+    assert controller.replay(browser).verdict.shows_overlay
+    controller.stop()  # as on leaving
+    assert not controller.replay(browser).verdict.shows_overlay
+    assert controller.restore(phantom.case.folder, controller.camera)
+    assert controller.replay(browser).verdict.shows_overlay and controller.live.overlay_visible
+    controller.close()
+
+
 def test_a_recording_of_another_case_shows_no_overlay(application, phantom, model, frames, tmp_path):
     scene, _logic = application
     controller = LiveController(scene)

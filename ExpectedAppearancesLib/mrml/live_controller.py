@@ -107,8 +107,11 @@ class LiveController:
         if node_of_role(self._scene, FRAME) is None:
             return False
         self.open_case(case_path)
+        if self.live.frame is None:  # it went with the nodes of another case
+            return False
         self.live.take_replayed(camera)
         self._set_visible(False, changed=True)
+        self._replayed = None  # a recording that is looked at is shown anew, with its overlay
         return True
 
     def start(self, choice: Choice, single: bool = False, model: OpenedModel | None = None) -> None:
