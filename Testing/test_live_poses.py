@@ -10,6 +10,7 @@ from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at, transform
 from ExpectedAppearancesLib.live import alignment, recording
+from ExpectedAppearancesLib.registration.poses_file import read_poses
 from ExpectedAppearancesLib.registration.predictor import Prediction
 
 CAMERA = Camera(320, 240, 700.0, 690.0, 170.0, 108.0)
@@ -98,3 +99,15 @@ def test_export_refuses_a_change_of_camera_and_an_empty_recording(tmp_path):
     assert not (tmp_path / "a" / "poses.json").exists()
     with pytest.raises(InputError, match="no frame"):
         recording.export_recording(tmp_path / "b", [])
+
+
+def test_true_poses_of_a_camera_whose_distortion_was_taken_out_are_collected_in_one_file(tmp_path):
+    """As prepared frames are; a file writes no distortion as zeros."""
+    camera = Camera(320, 240, 700.0, 690.0, 170.0, 108.0, (-0.2, 0.1, 0, 0, 0)).without_distortion()
+    for number in range(2):
+        frame = recording.RecordedFrame(0.0, "f", camera, Prediction(POSE, True, 0.9, 1.0), noise(seed=number))
+        path = recording.add_truth(tmp_path, frame, POSE)
+    assert len(read_poses(path)[1]) == 2
+    other = recording.RecordedFrame(0.0, "f", camera.resized(160, 120), frame.prediction, noise(160, 120))
+    with pytest.raises(InputError, match="another camera"):
+        recording.add_truth(tmp_path, other, POSE)

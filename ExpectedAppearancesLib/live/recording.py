@@ -157,7 +157,8 @@ def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray)
     entries = []
     if path.is_file():
         camera, known = read_poses(path)
-        if camera != frame.camera:
+        # As dicts, since no distortion is read back as zeros.
+        if camera is None or camera.to_dict() != frame.camera.to_dict():
             raise InputError(f"{path}: holds frames of another camera or size; choose another folder.")
         entries = [f.to_dict() for f in known]
     number = len(entries)
