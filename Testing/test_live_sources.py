@@ -97,6 +97,36 @@ def test_only_new_images_of_a_folder(tmp_path):
     assert read_all(source, 1)[0].name == "2.png"
 
 
+def test_repeating_only_new_images_leaves_the_old_ones_out(tmp_path):
+    write_images(tmp_path, ["1.png"])
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, only_new=True, repeat=True)
+    source.open()
+    assert read_all(source, 1, 0.05) == []
+    write_images(tmp_path, ["2.png"])
+    assert [frame.name for frame in read_all(source, 3)] == ["2.png"] * 3
+
+
+@pytest.mark.parametrize("kind", ["folder", "dangling link"])
+def test_what_cannot_be_read_does_not_hold_up_the_images_after_it(tmp_path, kind):
+    write_images(tmp_path, ["b.png"])
+    if kind == "folder":
+        (tmp_path / "a.png").mkdir()
+    else:
+        try:
+            (tmp_path / "a.png").symlink_to(tmp_path / "gone.png")
+        except OSError:
+            pytest.skip("no links here")
+    now = [0.0]
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, clock=lambda: now[0])
+    source.open()
+    assert source.read() is None  # its writer may have locked it
+    now[0] += 3
+    with pytest.raises(InputError, match=r"a\.png: cannot be read"):
+        source.read()
+    now[0] += 1
+    assert source.read().name == "b.png"
+
+
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
     """Twenty frames at 50 per second, each of its own grey."""

@@ -83,7 +83,8 @@ class ImageFiles:
             raise InputError("no images are listed; give at least one.")
         self._due_s = self._clock()
         if self._seen is None:
-            self._seen = set(self._paths()) if self._folder and self._only_new else set()
+            self._left_out = set(self._paths()) if self._folder and self._only_new else set()
+            self._seen = set(self._left_out)
 
     def read(self) -> LiveFrame | None:
         if self._clock() < self._due_s:
@@ -100,7 +101,7 @@ class ImageFiles:
             self._number += 1
             return LiveFrame(_decoded(data, path), self._clock(), self._number - 1, path.name, self._given.get(path))
         if self._repeat and paths:
-            self._seen = set()
+            self._seen = set(self._left_out)
         elif not self._folder:
             raise SourceEnded("the last image was shown.")
         return None
@@ -124,20 +125,22 @@ class ImageFiles:
 
     def _whole_file(self, path: Path) -> bytes | None:
         """The file's content, or None while it is being written. Raises InputError for one that never gets whole."""
+        version = data = None
+        trouble = "damaged, its end is missing"
         try:
             state = path.stat()
+            version = (state.st_size, state.st_mtime_ns)
             data = path.read_bytes()
-        except OSError as error:
+        except OSError as error:  # locked by its writer, renamed, or never to be read
             if not self._folder and not path.exists():
                 self._seen.add(path)
                 raise InputError(f"{path}: image not found; check the path.") from error
-            return None  # locked by its writer, or renamed
+            trouble = f"cannot be read ({error.strerror})"
         now = self._clock()
-        version = (state.st_size, state.st_mtime_ns)
         before, since_s = self._unfinished.get(path, (None, now))
         if version != before:
             since_s = now
-        whole = _has_its_end(data, path.suffix.lower())
+        whole = data is not None and _has_its_end(data, path.suffix.lower())
         if whole or (whole is None and version == before and now - since_s >= 0.2):
             self._unfinished.pop(path, None)
             return data
@@ -145,7 +148,7 @@ class ImageFiles:
         if now - since_s > DAMAGED_AFTER_S:
             self._seen.add(path)
             del self._unfinished[path]
-            raise InputError(f"{path}: damaged, its end is missing; it is left out.")
+            raise InputError(f"{path}: {trouble}; it is left out.")
         return None
 
 
