@@ -88,6 +88,19 @@ def test_a_file_that_never_gets_whole_is_said_and_left_out(tmp_path):
     assert source.read().name == "b.png"
 
 
+def test_an_image_whose_header_is_nonsense_is_said_and_left_out(tmp_path):
+    """Of a size that OpenCV does not just decline, but raises its own error for."""
+    write_images(tmp_path, ["b.png"])
+    header = bytearray(cv2.imencode(".bmp", noise())[1].tobytes())
+    header[18:26] = (200000).to_bytes(4, "little") * 2
+    (tmp_path / "a.bmp").write_bytes(header)
+    came = []
+    feed = Feed(sources.ImageFiles(tmp_path, rate_hz=1000), came.append)
+    feed.start()
+    within(10, lambda: came or feed.status.state is FeedState.LOST)
+    assert feed.stop() and [frame.name for frame in came] == ["b.png"]
+
+
 def test_only_new_images_of_a_folder(tmp_path):
     write_images(tmp_path, ["1.png"])
     source = sources.ImageFiles(tmp_path, rate_hz=1000, only_new=True)

@@ -264,7 +264,10 @@ def _has_its_end(data: bytes, suffix: str) -> bool | None:
 def _decoded(data: bytes, path: Path) -> np.ndarray:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    except cv2.error:  # a damaged header's size
+        image = None
     if image is None:
         raise InputError(f"{path}: not an image that can be read (or damaged); it is left out.")
     return np.ascontiguousarray(image[..., ::-1])
