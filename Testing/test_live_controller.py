@@ -121,6 +121,39 @@ def test_overlay_goes_when_frames_stop_and_returns_with_them(application, phanto
     controller.close()
 
 
+def test_the_picture_that_is_shown_is_no_source(application, phantom, model, frames):
+    """It changes with each frame that is shown: an old picture would be new for ever."""
+    scene, _logic = application
+    node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    own = controller.live.frame.GetID()
+    controller.stop()
+    with pytest.raises(InputError, match="Microscope frame: is the picture that this panel shows"):
+        controller.start(choice_of(phantom, node_name=own), model=model)
+    assert not controller.running
+    controller.close()
+
+
+@pytest.mark.parametrize("removed", ["frame", "Vessels", "outline"])
+def test_nodes_that_the_user_removed_are_there_again_after_a_start(application, phantom, model, frames, removed):
+    scene, _logic = application
+    node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    controller.stop()
+    live = controller.live
+    scene.RemoveNode(live.frame if removed == "frame" else (live.models | live.lines)[removed])
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
+    live = controller.live
+    assert all(scene.IsNodePresent(n) for n in (live.frame, *live.models.values(), *live.lines.values()))
+    assert len([n for n in scene.GetNodesByName("Vessels")]) == 1
+    controller.close()
+
+
 @pytest.mark.parametrize(
     "garbage",
     [

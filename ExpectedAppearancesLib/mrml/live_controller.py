@@ -29,7 +29,7 @@ from ..poses.craniotomy import find_craniotomy
 from . import live_record
 from .live_align import Alignment, pose_of_landmarks
 from .live_drawing import at_once
-from .live_nodes import node_of_role, remove_live_nodes
+from .live_nodes import ROLE_ATTRIBUTE, node_of_role, remove_live_nodes
 from .live_scene import FRAME, LiveScene, OverlayOptions
 from .live_stream import NodeFrames
 
@@ -339,7 +339,8 @@ class LiveController:
 
     # ----------------------------------------------------------------------------------------------------- internal
     def _is_open(self, folder: Path) -> bool:
-        return self.case is not None and self.live is not None and self.case.folder == Path(folder).absolute()
+        there = self.case is not None and self.live is not None and self.live.is_whole
+        return there and self.case.folder == Path(folder).absolute()
 
     def _put_up(self, case: Case, overlays: OverlayMaker) -> None:
         """The nodes of a case, instead of those of the case before."""
@@ -400,6 +401,10 @@ class LiveController:
         node = self._scene.GetNodeByID(choice.node_name) or self._scene.GetFirstNodeByName(choice.node_name)
         if node is None or not node.IsA("vtkMRMLVolumeNode"):
             raise InputError(f"{choice.node_name}: there is no such volume in the scene; choose it again.")
+        if node is node_of_role(self._scene, FRAME) or node.GetAttribute(ROLE_ATTRIBUTE):
+            raise InputError(
+                f"{node.GetName()}: is the picture that this panel shows; choose the volume that frames arrive in."
+            )
         return node
 
     def _status(self, update: Update) -> Status:

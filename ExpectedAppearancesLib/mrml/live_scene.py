@@ -89,6 +89,13 @@ class LiveScene:
         return changed
 
     @property
+    def is_whole(self) -> bool:
+        """Whether the user removed none of the nodes."""
+        nodes = (self.transform, self.frame, self.frustum, self.fill, self.backdrop)
+        nodes += (*self.models.values(), *self.lines.values())
+        return all(self._scene.IsNodePresent(node) for node in nodes if node is not None)
+
+    @property
     def camera_to_world(self) -> np.ndarray:
         """Camera mm to what the views show: RAS, moved as the case's models are where they hang under a transform."""
         return matrix_of(self.transform, to_world=True)
