@@ -157,6 +157,7 @@ def test_controls_as_a_table():
     assert can(**live) == Controls(False, False, True, True, True, True, False)
     assert can(**live, frozen=True).align and not can(**live).align
     assert not can(**live, frozen=True, aligning=True).freeze
+    assert can(ready=True, running=True, frozen=True).freeze  # a single step found no picture: let it go on again
     assert not can(**live, recording=True).single
 
 

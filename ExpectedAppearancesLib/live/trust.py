@@ -120,7 +120,7 @@ def controls(ready: bool, running: bool, frozen: bool, has_frame: bool, aligning
         choose=not running,
         start=ready and not running,
         stop=running,
-        freeze=running and has_frame and not aligning,
+        freeze=running and (has_frame or frozen) and not aligning,
         single=ready and not aligning and not recording,
         record=running and not aligning,
         align=running and frozen and has_frame,
