@@ -17,9 +17,12 @@ from ExpectedAppearancesLib.registration.predictor import Prediction
 
 slicer = pytest.importorskip("slicer")
 
+import vtk  # noqa: E402
+from live_cases import choice_of, record, wait_for  # noqa: E402
 from mrml_views import SliceView, new_application  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import live_views  # noqa: E402
+from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_scene import LiveScene, OverlayOptions  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_views import LiveViews  # noqa: E402
 
@@ -40,6 +43,11 @@ def result_of(case, accepted=True, seed=0) -> LiveResult:
     overlay = OverlayMaker(case.vessels).make(CAMERA, POSE) if accepted else None
     prediction = Prediction(POSE, accepted, 0.9, 5.0)
     return LiveResult(LiveFrame(image, 0.0, seed), case_key(case), image, CAMERA, prediction, overlay)
+
+
+@pytest.fixture
+def application():
+    return new_application()
 
 
 @pytest.fixture
@@ -152,3 +160,63 @@ def test_lines_that_were_not_wanted_are_those_of_the_frame_when_they_are(case, w
         drawn_px = x_mm / z_mm * CAMERA.fx + CAMERA.cx, y_mm / z_mm * CAMERA.fy + CAMERA.cy
         np.testing.assert_allclose(drawn_px, points_px[0], atol=1e-6)
         assert live.lines[role].GetDisplayNode().GetVisibility()
+
+
+def test_views_follow_when_the_user_moves_the_models_under_a_frame_that_is_held(application, phantom, model, frames):
+    """Frozen, aligned or replayed, no new frame comes that would put views and camera right."""
+    scene, logic = application
+    view = SliceView(scene, logic, "Microscope", SIZE)
+    controller = LiveController(scene, LiveViews(view.logic, lambda: None))
+    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+
+    def move_and_look(step) -> None:
+        for angle in (20, 50):  # first under a transform at all, then that is moved
+            moved = vtk.vtkTransform()
+            moved.Translate(40, -25, 60)
+            moved.RotateWXYZ(angle, 1, 2, -0.5)
+            patient.SetMatrixTransformToParent(moved.GetMatrix())
+            if controller.alignment is None:
+                for node in controller.live.models.values():
+                    node.SetAndObserveTransformNodeID(patient.GetID())
+            step()
+            assert apart_mm(view.node, controller.live) < 1e-6
+            np.testing.assert_allclose(
+                controller.live.camera_to_world, _matrix(patient.GetMatrixTransformToWorld) @ camera_to_ras()
+            )
+
+    def camera_to_ras():
+        return _matrix(controller.live.transform.GetMatrixTransformToParent)
+
+    patient = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Patient moved")
+    controller.replay(browser)
+    move_and_look(lambda: controller.replay(browser))
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    move_and_look(controller.tick)
+    controller.begin_alignment().set_pose(frames[0][3])
+    controller.tick()
+    move_and_look(controller.tick)
+    controller.finish_alignment(keep=True)
+    truth = controller.truth
+    move_and_look(controller.tick)
+    assert controller.truth is truth and controller.live.lines["truth"].GetDisplayNode().GetVisibility()
+    controller.close()
+
+
+def apart_mm(slice_node, live) -> float:
+    """Of the frame's corners from the plane of the slice."""
+    width, height = live.camera.width - 1, live.camera.height - 1
+    corners = np.array([(0, 0, 0, 1), (width, 0, 0, 1), (0, height, 0, 1)], float).T
+    world = live.camera_to_world @ _matrix(live.frame.GetIJKToRASMatrix) @ corners
+    slice_to_world = vtk_matrix_values(slice_node.GetSliceToRAS())
+    return float(np.abs((np.linalg.inv(slice_to_world) @ world)[2]).max())
+
+
+def _matrix(get) -> np.ndarray:
+    matrix = vtk.vtkMatrix4x4()
+    get(matrix)
+    return vtk_matrix_values(matrix)
+
+
+def vtk_matrix_values(matrix) -> np.ndarray:
+    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])

@@ -66,6 +66,7 @@ class LiveController:
         self._registers = True
         self._overlays: OverlayMaker | None = None
         self._replayed: tuple | None = None
+        self._seen_from: np.ndarray | None = None  # camera to world, as the views were laid out last
 
     @property
     def running(self) -> bool:
@@ -313,7 +314,10 @@ class LiveController:
     def replay(self, browser) -> Status:
         """Draw the overlay of the recorded frame that `browser` is at; call it whenever it may have moved."""
         key = (browser.GetID(), browser.GetSelectedItemNumber(), id(self.live))
-        if self.running or self.live is None or self._replayed == key:
+        if self.running or self.live is None:
+            return self.status
+        if self._replayed == key:
+            self._follow_models()
             return self.status
         self._replayed = key
         frame, recorded_key = live_record.frame_at(browser)
@@ -391,6 +395,8 @@ class LiveController:
         self.live.set_overlay_visible(visible)
         if update.new is not None or visible != self._was_visible():
             self._follow(changed)
+        else:
+            self._follow_models()
         if update.new is not None and self.recorder is not None:
             self.recorder.add(update.new)
         if self.alignment is not None:
@@ -420,7 +426,14 @@ class LiveController:
 
     def _follow(self, changed: bool) -> None:
         if self.views is not None and self.live is not None and self.live.frame is not None:
+            self._seen_from = self.live.camera_to_world
             self.views.follow(self.live, changed)
+
+    def _follow_models(self) -> None:
+        """The user may move the models, and camera and frame with them, while no new frame comes."""
+        self.live.follow_models()
+        if self.views is not None and not np.array_equal(self.live.camera_to_world, self._seen_from):
+            self._follow(False)
 
     def _forget_truth(self) -> None:
         self.truth = None

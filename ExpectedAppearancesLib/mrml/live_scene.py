@@ -115,12 +115,14 @@ class LiveScene:
 
     def _newest_change(self) -> tuple:
         data = self.frame.GetImageData()
-        return data.GetMTime() if data is not None else 0, self.transform.GetTransformToWorldMTime()
+        # The transform's own: the user may move what it hangs under.
+        return data.GetMTime() if data is not None else 0, self.transform.GetTransformToParent().GetMTime()
 
     def take_replayed(self, camera: Camera) -> bool:
         """The frame node was given a recorded frame of `camera`. True when the plane or the frame's size changed."""
         from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
+        self.follow_models()
         matrix = vtkMatrix4x4()
         self.frame.GetIJKToRASMatrix(matrix)
         return self._put_plane(camera, matrix.GetElement(2, 3))
