@@ -89,6 +89,24 @@ def test_a_dark_moment_cuts_nothing_off():
     assert picture_box(np.zeros((240, 320, 3), np.uint8)) == (0, 0, 320, 240)
 
 
+def test_light_on_the_border_spoils_no_frame_after_it():
+    """A menu or a flash over the black borders of a picture that the camera was calibrated without."""
+    preparation = FramePreparation(CAMERA, FrameSettings(crop_borders=True))
+    picture = noise()
+    framed = cv2.copyMakeBorder(picture, 0, 0, 80, 60, cv2.BORDER_CONSTANT, value=(0, 0, 0))
+    lit, dark = framed.copy(), framed.copy()
+    lit[40:80, 10:50] = 200
+    dark[:, :250] = 0
+    for frame, fits in ((dark, False), (lit, False), (framed, True), (lit, False), (framed, True), (dark, True)):
+        if fits:
+            prepared, camera = preparation.prepare(frame)
+            assert camera == CAMERA
+            np.testing.assert_array_equal(prepared, frame[:, 80:400])
+        else:
+            with pytest.raises(InputError, match="aspect ratio"):
+                preparation.prepare(frame)
+
+
 @pytest.mark.parametrize(
     "image, words",
     [

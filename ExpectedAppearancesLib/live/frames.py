@@ -82,25 +82,37 @@ class FramePreparation:
     def _camera_and_box(self, image: np.ndarray) -> tuple[Camera, tuple[int, int, int, int]]:
         """The camera of the part of the frame that is kept, and that part: left, top, width, height in px."""
         height, width = image.shape[:2]
-        whole = (0, 0, width, height)
         if self._frame_size != (width, height):
             self._frame_size, self._box = (width, height), None
+        with_borders = _same_aspect(self._camera, width, height)  # as A was calibrated
+        box = (0, 0, width, height) if with_borders else None
         if self._settings.crop_borders:
-            # Only ever grown: a dark moment must not cut a part of the picture away.
-            found = picture_box(image)
-            self._box = found if self._box is None else _union(self._box, found)
-        box = self._box or whole
-        if _same_aspect(self._camera, width, height):
-            camera = self._camera.resized(width, height)
-            return camera.cropped(*box), box
-        if self._settings.crop_borders and _same_aspect(self._camera, box[2], box[3]):
-            return self._camera.resized(box[2], box[3]), box  # A was calibrated on the picture without its borders
+            box = self._picture_box(image, with_borders)
+        if box is not None and with_borders:
+            return self._camera.resized(width, height).cropped(*box), box
+        if box is not None:
+            return self._camera.resized(box[2], box[3]), box
         found = picture_box(image)
         raise InputError(
             f"the frame is {width} x {height} px ({found[2]} x {found[3]} px without black borders), the camera "
             f"{self._camera.width} x {self._camera.height} px: another aspect ratio; cut black borders off, give the "
             "source the size that the camera was calibrated with, or calibrate again."
         )
+
+    def _picture_box(self, image: np.ndarray, with_borders: bool) -> tuple[int, int, int, int] | None:
+        """The frame without black borders; None where the camera was calibrated on a picture of another shape."""
+
+        def fits(box: tuple) -> bool:
+            return with_borders or _same_aspect(self._camera, box[2], box[3])
+
+        found = picture_box(image)
+        known = self._box or found
+        # Only ever grown: a dark moment must not cut a part of the picture away.
+        grown = _union(known, found)
+        # But a menu or a flash on the border must not add to it for ever.
+        box = next((box for box in (grown, found) if fits(box)), None)
+        self._box = box or (known if fits(known) else grown)
+        return box
 
     def _undistortion(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         import cv2
