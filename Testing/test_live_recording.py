@@ -7,6 +7,7 @@ import pytest
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.demo.phantom import PhantomPainter, covered_frame, make_phantom
+from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.live.trust import Sight
 from ExpectedAppearancesLib.registration.poses_file import read_poses
 
@@ -146,6 +147,9 @@ def test_a_recording_of_another_case_shows_no_overlay(application, phantom, mode
     controller.open_case(other.case.folder)
     assert controller.replay(browser).verdict.sight is Sight.OTHER_CASE
     assert not controller.live.overlay_visible
+    with pytest.raises(InputError, match="another case"):  # whose world may have other axes
+        live_record.export(browser, tmp_path / "out", other.case)
+    assert not (tmp_path / "out").exists()
     controller.close()
 
 
@@ -154,7 +158,7 @@ def test_export_gives_poses_images_and_transforms(application, phantom, model, f
     controller = LiveController(scene)
     images = [frames[1][0], covered_frame(1, SMALL), frames[1][9]]
     browser, predicted = record(controller, scene, phantom, model, images)
-    path = live_record.export(browser, tmp_path / "out", phantom.case.space)
+    path = live_record.export(browser, tmp_path / "out", phantom.case)
     camera, exported = read_poses(path)
     assert camera == SMALL or (camera.width, camera.height) == (320, 240)
     for i, frame in enumerate(exported):
@@ -224,7 +228,7 @@ def test_a_steadied_session_draws_and_records_the_filtered_pose(application, pha
         if visible:
             expected = np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.linalg.inv(filtered)
             np.testing.assert_allclose(camera_to_ras_of(controller.live.transform), expected, atol=1e-6)
-    _camera, exported = read_poses(live_record.export(browser, tmp_path / "out", phantom.case.space))
+    _camera, exported = read_poses(live_record.export(browser, tmp_path / "out", phantom.case))
     for entry, (visible, _filtered, own) in zip(exported, drawn):
         assert entry.extra["tracking"]["used"] == visible
         if visible:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..case.case import Case
 from ..errors import InputError
 from ..geometry.pose import camera_to_ras
+from ..live.estimator import case_key
 from ..live.recording import RecordedFrame, export_recording, from_note, to_note
 from ..live.session import LiveResult
 from . import scene as scenes
@@ -152,17 +154,22 @@ def put_back(browser, live_scene: LiveScene) -> None:
             node.SetAttribute(ROLE_ATTRIBUTE, role)  # copied as well, and in a loaded recording there is none
 
 
-def export(browser, folder: Path, space: str) -> Path:
+def export(browser, folder: Path, case: Case) -> Path:
     """Write the frames, poses.json and a transform (.tfm, camera to Slicer's world) of each frame with a pose.
 
-    Returns the path of poses.json. Raises InputError when it cannot be written.
+    case: that it was recorded with. Returns the path of poses.json. Raises InputError for a recording of another case,
+    and when it cannot be written.
     """
-    folder = Path(folder)
+    folder, noted = Path(folder), list(recorded_frames(browser, pixels=False))
+    if any(key != case_key(case) for _frame, key in noted):
+        raise InputError(
+            f"{browser.GetName()}: was recorded with the vessels of another case; choose that case, then export."
+        )
     poses_path = export_recording(folder, (frame for frame, _key in recorded_frames(browser)))
-    for number, (frame, _key) in enumerate(recorded_frames(browser, pixels=False)):
+    for number, (frame, _key) in enumerate(noted):
         pose = frame.camera_from_world
         if pose is not None:
-            write_transform(folder / "transforms" / f"{number:05d}.tfm", camera_to_ras(pose, space))
+            write_transform(folder / "transforms" / f"{number:05d}.tfm", camera_to_ras(pose, case.space))
     return poses_path
 
 

@@ -140,6 +140,6 @@ class RecordSection:
             self._say(_("{folder} is not empty; choose a new folder.").format(folder=folder))
             return
         with slicer.util.tryWithErrorDisplay(_("The recording could not be exported."), waitCursor=True):
-            space = self._controller.open_case(self._parameters().casePath).space
-            path = live_record.export(browser, Path(folder), space)
+            case = self._controller.open_case(self._parameters().casePath)
+            path = live_record.export(browser, Path(folder), case)
             self._say(_("Exported to {path}.").format(path=path), done=True)
