@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 
 import numpy as np
 import pytest
 
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.demo.phantom import make_phantom
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.live import loading
+from ExpectedAppearancesLib.live.estimator import case_key
 from ExpectedAppearancesLib.live.trust import Sight
 
 slicer = pytest.importorskip("slicer")
@@ -130,3 +134,23 @@ def test_a_volume_that_goes_while_the_model_is_read_is_waited_for(started, gate,
     node_with(scene, frames[1][2])
     wait_for(controller, lambda s: s.result is not None and s.result.frame.number > 0)
     np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][2])
+
+
+def test_a_case_that_was_made_again_in_its_folder_is_read_again(tmp_path, frames):
+    """With another calibration, say: the one that was read before would give wrong poses without a word."""
+    phantom = make_phantom(tmp_path / "case")
+    scene, _logic = new_application()
+    node_with(scene, frames[1][0])
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60))
+    wait_for(controller, lambda s: s.new)
+    first = controller.case
+    controller.start(choice_of(phantom, stale_s=60))
+    wait_for(controller, lambda s: s.new)
+    assert controller.case is first
+    shutil.rmtree(tmp_path / "case")
+    make_phantom(tmp_path / "case", seed=1)
+    controller.start(choice_of(phantom, stale_s=60))
+    status = wait_for(controller, lambda s: s.new or s.problem)
+    assert status.problem == "" and status.result.case_key == case_key(Case.open(tmp_path / "case")) != case_key(first)
+    controller.close()

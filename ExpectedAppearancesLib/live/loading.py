@@ -30,8 +30,9 @@ def load(
 ) -> Loaded:
     """Read what was chosen, but for what is given. Raises InputError with what is wrong."""
     source = open_source(choice)
-    if case is None or overlays is None:
-        case = Case.open(choice.case_path)
+    opened = Case.open(choice.case_path)
+    if case is None or overlays is None or _inputs(opened) != _inputs(case):  # made again in the same folder
+        case = opened
         case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now
         overlays = OverlayMaker(case.vessels)
     if not choice.needs_model:
@@ -41,6 +42,10 @@ def load(
     if choice.steady:
         check_can_steady(model.estimator if model else None, case.model_folder)
     return Loaded(source, case, overlays, model)
+
+
+def _inputs(case: Case) -> tuple:
+    return case.space, case.manifest["inputs"]
 
 
 class Loading:
