@@ -10,9 +10,12 @@ import pytest
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.geometry.camera import Camera
+from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.live import sources
 from ExpectedAppearancesLib.live.choice import Choice, SourceKind, open_source, problems_of
 from ExpectedAppearancesLib.live.feed import Feed, FeedState
+from ExpectedAppearancesLib.registration.poses_file import write_poses
 
 
 def noise(width=320, height=240, seed=0) -> np.ndarray:
@@ -190,6 +193,29 @@ def test_files_that_are_no_video_are_said(tmp_path):
         sources.VideoFile(tmp_path / "a.mp4").open()
     with pytest.raises(sources.SourceLost, match="not found"):
         sources.VideoFile(tmp_path / "b.mp4").open()
+
+
+def test_poses_of_a_videos_frames_are_shown_with_the_video(video):
+    """As `register` writes them."""
+    poses = [look_at(np.array([0.0, i, 90.0]), np.zeros(3), np.array([0.0, 1.0, 0.0])) for i in range(20)]
+    names = [video.with_name(f"v.avi#frame={i}") for i in range(20)]
+    entries = [{"image": name, "camera_from_world": pose} for name, pose in zip(names, poses)]
+    write_poses(video.parent / "poses.json", Camera(64, 48, 90.0, 90.0, 31.5, 23.5), entries)
+    opened = open_source(Choice(path=str(video.parent / "poses.json"), repeat=True))
+    assert opened.camera.width == 64
+    now = [0.0]
+    opened.source._clock = lambda: now[0]
+    opened.source.open()
+    seen = []
+    while len(seen) < 50:
+        now[0] += 0.02
+        frame = opened.source.read()
+        if frame is not None:
+            seen.append(round(int(frame.image_rgb[20, 20, 2]) / 10))
+            np.testing.assert_allclose(frame.given.camera_from_world, poses[seen[-1]])
+    assert set(seen) >= set(range(18))
+    opened.source.close()
+    (video.parent / "poses.json").unlink()
 
 
 class FakeCapture:

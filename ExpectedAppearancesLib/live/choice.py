@@ -9,7 +9,7 @@ from pathlib import Path
 from ..case.case import MANIFEST_NAME
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera, read_camera
-from .estimator import given_poses
+from .estimator import given_poses, poses_of_video
 from .frames import FrameSettings
 from .sources import IMAGE_SUFFIXES, USUAL_RATE_HZ, VIDEO_SUFFIXES, CaptureDevice, ImageFiles, Source, VideoFile
 
@@ -105,6 +105,9 @@ def _opened(choice: Choice) -> OpenedSource:
         return OpenedSource(ImageFiles(path, choice.rate_hz, choice.repeat, choice.only_new), None)
     if suffix == ".json":
         camera, images, given = given_poses(path)
+        video = poses_of_video(given)
+        if video is not None:
+            return OpenedSource(VideoFile(video[0], choice.repeat, given=video[1]), camera)
         return OpenedSource(ImageFiles(images, choice.rate_hz, choice.repeat, given=given), camera, len(images) == 1)
     if suffix in VIDEO_SUFFIXES:
         return OpenedSource(VideoFile(path, choice.repeat), None)

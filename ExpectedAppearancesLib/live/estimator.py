@@ -12,6 +12,7 @@ import numpy as np
 from ..case.case import Case
 from ..errors import InputError
 from ..geometry.camera import Camera
+from ..registration.footage import FRAME_MARK
 from ..registration.poses_file import read_poses
 
 if TYPE_CHECKING:
@@ -65,7 +66,8 @@ def open_model(case: Case) -> OpenedModel:
 
 
 def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path, Prediction]]:
-    """Frames that were registered before, from poses.json: camera, image paths, and the prediction of each path.
+    """Frames that were registered before, from poses.json: camera, paths (VIDEO#frame=N of a video), and the prediction
+    of each path.
 
     Raises InputError with every problem of the file.
     """
@@ -81,12 +83,26 @@ def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path,
         )
         for frame in frames
     }
-    missing = [frame.image for frame in frames if not frame.image.is_file()]
+    there = {frame.image for frame in frames if (_video_of(frame.image) or frame.image).is_file()}
+    missing = [frame.image for frame in frames if frame.image not in there]
     if len(missing) == len(frames):
         raise InputError(
             f"{poses_path}: none of its images exists, {missing[0]} for one; restore them beside the file."
         )
-    return camera, [frame.image for frame in frames if frame.image.is_file()], given
+    return camera, [frame.image for frame in frames if frame.image in there], given
+
+
+def poses_of_video(given: dict[Path, Prediction]) -> tuple[Path, dict[int, Prediction]] | None:
+    """The video whose frames all paths name, and the prediction of each number; None where they name anything else."""
+    videos = {_video_of(image) for image in given}
+    if len(videos) != 1 or None in videos:
+        return None
+    return videos.pop(), {int(image.name.rpartition(FRAME_MARK)[2]): found for image, found in given.items()}
+
+
+def _video_of(image: Path) -> Path | None:
+    name, mark, number = image.name.rpartition(FRAME_MARK)
+    return image.with_name(name) if mark and number.isdecimal() and not image.is_file() else None
 
 
 def _number(value, otherwise: float) -> float:

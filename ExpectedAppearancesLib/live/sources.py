@@ -153,13 +153,21 @@ class ImageFiles:
 
 
 class VideoFile:
-    """A video at its own speed; frames that are late are left out and counted."""
+    """A video at its own speed; frames that are late are left out and counted.
 
-    def __init__(self, path: Path, repeat: bool = False, clock: Callable[[], float] = time.monotonic):
-        self._path, self._repeat, self._clock = Path(path), repeat, clock
+    given: pose of each frame (by number) that was registered before.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        repeat: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+        given: dict[int, Prediction] | None = None,
+    ):
+        self._path, self._repeat, self._clock, self._given = Path(path), repeat, clock, given or {}
         self.dropped = 0
         self.can_wait = True
-        self._number = 0
         self._capture = None
 
     def open(self) -> None:
@@ -174,7 +182,7 @@ class VideoFile:
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
         self._interval_s = 1 / (rate_hz if 0 < rate_hz < 1000 else USUAL_RATE_HZ)
         self._due_s = self._clock()
-        self._read_any = False
+        self._number, self._read_any = 0, False
 
     def read(self) -> LiveFrame | None:
         now = self._clock()
@@ -195,8 +203,9 @@ class VideoFile:
             self.open()
             return None
         self._read_any = True
-        self._number += 1
-        return LiveFrame(np.ascontiguousarray(image[..., ::-1]), self._clock(), self._number - 1, f"{self._number - 1}")
+        number, self._number = self._number, self._number + 1
+        rgb = np.ascontiguousarray(image[..., ::-1])
+        return LiveFrame(rgb, self._clock(), number, f"{number}", self._given.get(number))
 
     def go_on(self) -> None:
         self._due_s = self._clock()
