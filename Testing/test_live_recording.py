@@ -94,6 +94,30 @@ def test_replay_shows_its_own_frame_after_the_session_went_on(application, phant
     controller.close()
 
 
+def test_another_recording_that_plays_gets_no_overlay_of_the_one_that_is_looked_at(application, phantom, model, frames):
+    """Slicer's sequence toolbar may have another recording than the panel; both play into the same nodes."""
+    scene, logic = application
+    controller = LiveController(scene)
+    first, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+    scene.RemoveNode(scene.GetFirstNodeByName("Stream"))
+    second, _predicted = record(controller, scene, phantom, model, frames[1][6:8])
+    first.SetSelectedItemNumber(0)
+    assert controller.replay(first).verdict.shows_overlay
+    for _again in range(2):
+        second.SetPlaybackActive(True)
+        second.SetSelectedItemNumber(1 - second.GetSelectedItemNumber())
+        logic.sequences.UpdateProxyNodesFromSequences(second)
+        assert not np.array_equal(shown_pixels(controller.live), frames[1][0])
+        assert controller.replay(first).verdict.shows_overlay
+        np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][0])
+        assert not second.GetPlaybackActive()
+    first.SetPlaybackActive(True)  # its own may go on
+    logic.sequences.UpdateProxyNodesFromSequences(first)
+    controller.replay(first)
+    assert first.GetPlaybackActive()
+    controller.close()
+
+
 def test_a_loaded_scene_shows_its_last_frame_without_overlay(application, phantom, model, frames):
     scene, _logic = application
     node_with(scene, frames[1][3])

@@ -316,10 +316,11 @@ class LiveController:
         key = (browser.GetID(), browser.GetSelectedItemNumber(), id(self.live))
         if self.running or self.live is None:
             return self.status
-        if self._replayed == key:
+        if self._replayed == key and self.live.intact:
             self._follow_models()
             return self.status
         self._replayed = key
+        live_record.pause_playback(self._scene, but=browser)
         frame, recorded_key = live_record.frame_at(browser)
         verdict = Verdict(Sight.FROZEN if frame.prediction.accepted else Sight.REFUSED)
         if recorded_key != case_key(self.case):

@@ -115,10 +115,10 @@ def recordings(scene) -> list:
     return [node for node in nodes if node.GetAttribute(BROWSER_ATTRIBUTE)]
 
 
-def pause_playback(scene) -> None:
-    """Recordings play into the nodes that a session shows its frames in: not both at once."""
+def pause_playback(scene, but=None) -> None:
+    """Recordings, and sessions, show their frames in the same nodes: not two at once. but: the one that may go on."""
     for browser in recordings(scene):
-        if browser.GetPlaybackActive():
+        if browser is not but and browser.GetPlaybackActive():
             browser.SetPlaybackActive(False)
 
 

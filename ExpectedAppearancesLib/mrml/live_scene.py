@@ -110,7 +110,7 @@ class LiveScene:
 
     @property
     def intact(self) -> bool:
-        """Whether frame and transform are still as `show` left them: a recording plays into the same nodes."""
+        """Whether frame and transform are still as they were put up: a recording plays into the same nodes."""
         return self._stamp is None or self._stamp == self._newest_change()
 
     def _newest_change(self) -> tuple:
@@ -125,6 +125,7 @@ class LiveScene:
         self.follow_models()
         matrix = vtkMatrix4x4()
         self.frame.GetIJKToRASMatrix(matrix)
+        self._stamp = self._newest_change()
         return self._put_plane(camera, matrix.GetElement(2, 3))
 
     def put_plane_at(self, depth_mm: float) -> None:

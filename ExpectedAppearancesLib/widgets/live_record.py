@@ -21,7 +21,7 @@ class RecordSection:
     def __init__(self, ui, controller: LiveController, parameters, say, moved):
         self._ui, self._controller, self._parameters, self._say = ui, controller, parameters, say
         self._moved = moved
-        self._watched: tuple | None = None
+        self._watched: list[tuple] = []
         ui.recordButton.connect("toggled(bool)", self._on_record)
         ui.browserComboBox.connect("currentNodeChanged(vtkMRMLNode*)", self._on_browser)
         ui.replaySlider.connect("valueChanged(int)", self._on_slider)
@@ -46,7 +46,7 @@ class RecordSection:
         else:
             set_text(ui.recordLabel, "")
         browser = self._browser()
-        self._watch(browser)
+        self._watch([] if self._controller.running else live_record.recordings(slicer.mrmlScene))
         ui.exportButton.enabled = browser is not None and not recording
         ui.replaySlider.enabled = browser is not None and not self._controller.running
         if browser is None:
@@ -61,26 +61,27 @@ class RecordSection:
         return self._replay(browser)
 
     def close(self) -> None:
-        """Let go of the recording that is looked at."""
-        self._watch(None)
+        """Let go of the recordings."""
+        self._watch([])
 
-    def _watch(self, browser) -> None:
-        """Follow a recording at once: Slicer shows its next frame before the next tick, and the overlay is of the last.
+    def _watch(self, browsers: list) -> None:
+        """Follow them at once: Slicer shows their next frame before the next tick, and the overlay is of the last.
 
         Ticks are rare while nothing runs, and rarer still while the computer is busy.
         """
-        node, tag = self._watched or (None, None)
-        if node is browser:
+        if browsers == [browser for browser, _tag in self._watched]:
             return
-        if node is not None:
-            node.RemoveObserver(tag)
-        self._watched = None
-        if browser is not None:
-            self._watched = browser, browser.AddObserver("ModifiedEvent", self._on_moved)
+        for browser, tag in self._watched:
+            browser.RemoveObserver(tag)
+        self._watched = [(browser, browser.AddObserver("ModifiedEvent", self._on_moved)) for browser in browsers]
 
-    def _on_moved(self, _caller, _event) -> None:
-        if not self._controller.running and not slicer.mrmlScene.IsBatchProcessing():
-            self._moved()
+    def _on_moved(self, browser, _event) -> None:
+        p = self._parameters()
+        if p is None or self._controller.running or slicer.mrmlScene.IsBatchProcessing():
+            return
+        if p.browser is not browser:  # Slicer's toolbar plays another one than was chosen here
+            p.browser = browser
+        self._moved()
 
     def _replay(self, browser) -> Status | None:
         p = self._parameters()

@@ -122,12 +122,7 @@ def records_and_replays(test) -> None:
     with tempfile.TemporaryDirectory() as folder:
         _phantom, widget = started(Path(folder))
         next_result(test, widget)
-        widget.ui.recordButton.checked = True
-        for _ in range(6):
-            next_result(test, widget)
-        widget.ui.recordButton.checked = False
-        widget.ui.startButton.click()
-        browser = widget.panel.parameters().browser
+        first, browser = (make_recording(test, widget, count) for count in (2, 6))
         test.assertGreaterEqual(browser.GetNumberOfItems(), 6)
         controller = widget.panel.controller
         for item, wait_s in ((0, 0.0), (3, 0.0), (3, 0.3), (1, 0.0)):  # at once, and when Slicer has done the rest
@@ -141,6 +136,22 @@ def records_and_replays(test) -> None:
                 continue  # a refused pose moves nothing
             matrix = slicer.util.arrayFromTransformMatrix(controller.live.transform)
             np.testing.assert_allclose(matrix, np.diag([-1, -1, 1, 1.0]) @ np.linalg.inv(pose), atol=1e-6)
+        first.SetSelectedItemNumber(0)  # as Slicer's own toolbar does, with another one than is chosen here
+        test.assertIs(widget.panel.parameters().browser, first)
+        test.assertEqual(controller.result.frame.name, frame_at(first)[0].name)
+
+
+def make_recording(test, widget, count: int):
+    """A recording of so many frames or more; the session is over then."""
+    if not widget.panel.controller.running:
+        widget.ui.startButton.click()
+        next_result(test, widget)
+    widget.ui.recordButton.checked = True
+    for _ in range(count):
+        next_result(test, widget)
+    widget.ui.recordButton.checked = False
+    widget.ui.startButton.click()
+    return widget.panel.parameters().browser
 
 
 def aligns_by_hand(test) -> None:
