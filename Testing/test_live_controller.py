@@ -24,6 +24,7 @@ from mrml_views import SliceView, ThreeDView, new_application  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import live_views  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
+from ExpectedAppearancesLib.mrml.live_stream import NodeFrames  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_views import LiveViews  # noqa: E402
 
 
@@ -119,6 +120,22 @@ def test_overlay_goes_when_frames_stop_and_returns_with_them(application, phanto
     assert status.verdict.sight is Sight.FOLLOWING
     assert add_of(phantom, poses[5], status.result.prediction.camera_from_world) < 0.3
     controller.close()
+
+
+def test_a_picture_that_did_not_change_is_no_new_frame(application, frames):
+    """A stream says so twice for each frame; what only seems to come anew would never get too old."""
+    scene, _logic = application
+    stream = node_with(scene, frames[1][0])
+    came = []
+    source = NodeFrames(scene, stream, came.append)
+    for _again in range(3):
+        stream.InvokeCustomModifiedEvent(stream.ImageDataModifiedEvent)
+    assert len(came) == 1
+    for image in frames[1][1:4]:
+        send(stream, image)
+        stream.InvokeCustomModifiedEvent(stream.ImageDataModifiedEvent)
+    assert [frame.number for frame in came] == [0, 1, 2, 3]
+    source.close()
 
 
 def test_the_picture_that_is_shown_is_no_source(application, phantom, model, frames):

@@ -24,7 +24,7 @@ class NodeFrames:
         self._id, self._name = node.GetID(), node.GetName()
         self._node = self._tags = None
         self._number = 0
-        self._stamp = -1
+        self._stamp: tuple | None = None
         self._problem = ""
         self._attach(node)
 
@@ -62,14 +62,17 @@ class NodeFrames:
         if self._node is not None:
             for tag in self._tags:
                 self._node.RemoveObserver(tag)
-        self._node = self._tags = None
+        self._node = self._tags = self._stamp = None
 
     def _on_image(self, _caller=None, _event=None) -> None:
         if hasattr(self._node, "DecodeFrame"):
             self._node.DecodeFrame()
         data = self._node.GetImageData()
-        stamp = (id(data), data.GetMTime()) if data is not None else -1
-        if data is None or stamp == self._stamp:  # one change may send more than one event
+        if data is None:
+            return
+        # The object itself: VTK wraps it anew, with another id, each time that nobody holds it.
+        stamp = (data, data.GetMTime())
+        if stamp == self._stamp:  # one change may send more than one event
             return
         self._stamp = stamp
         image = pixels_of(data)
