@@ -46,6 +46,7 @@ def run_sample(panel: LivePanel) -> bool:
     parameters.casePath, parameters.sourcePath = str(case), str(frames)
     parameters.sourceKind = SourceKind.PATH.value
     parameters.cameraPath = ""
+    parameters.cropBorders = parameters.flipRows = False  # the sample's frames are as they should be
     parameters.repeat, parameters.onlyNew, parameters.rateHz = True, False, RATE_HZ
     panel.refresh()
     return panel.start()
