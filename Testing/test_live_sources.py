@@ -229,12 +229,17 @@ class FakeCapture:
     def isOpened(self):
         return type(self).plugged
 
-    def set(self, *_):
+    size = (320, 240)  # what drivers start with is rarely what they can
+
+    def set(self, what, value):
+        if what in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT):
+            width, height = self.size
+            self.size = (int(value), height) if what == cv2.CAP_PROP_FRAME_WIDTH else (width, int(value))
         return True
 
     def read(self):
         time.sleep(0.002)
-        return (True, noise()) if type(self).plugged else (False, None)
+        return (True, noise(*self.size)) if type(self).plugged else (False, None)
 
     def release(self):
         pass
@@ -259,6 +264,17 @@ def test_feed_says_that_the_device_is_lost_and_returns_with_it(monkeypatch):
     after = len(frames)
     time.sleep(0.05)
     assert len(frames) == after
+
+
+def test_a_device_is_asked_for_the_size_that_the_camera_was_calibrated_with(monkeypatch):
+    """Drivers start with 640 x 480, which is another shape than most microscopes' pictures."""
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+    choice = Choice(kind=SourceKind.DEVICE, device="0")
+    for camera, size in ((Camera(384, 216, 700, 700, 191.5, 107.5), (384, 216)), (None, (320, 240))):
+        source = open_source(choice, camera).source
+        source.open()
+        assert source.read().image_rgb.shape[1::-1] == size
+        source.close()
 
 
 def test_feed_ends_after_the_last_file_and_survives_a_driver_that_fails(tmp_path):

@@ -81,34 +81,38 @@ def problems_of(choice: Choice) -> list[str]:
     return found
 
 
-def open_source(choice: Choice) -> OpenedSource:
-    """The source that was chosen. Raises InputError with every problem."""
+def open_source(choice: Choice, case_camera: Camera | None = None) -> OpenedSource:
+    """The source that was chosen. case_camera: of the frames, unless the choice or poses.json names another.
+
+    Raises InputError with every problem.
+    """
     problems = Problems()
     opened = camera = None
     with problems.collect():
         camera = read_camera(choice.camera_path) if choice.camera_path else None
     with problems.collect():
-        opened = _opened(choice)
+        opened = _opened(choice, camera or case_camera)
     problems.raise_if_any()
     return OpenedSource(opened.source, camera or opened.camera, opened.still)
 
 
-def _opened(choice: Choice) -> OpenedSource:
+def _opened(choice: Choice, camera: Camera | None) -> OpenedSource:
     if choice.kind is SourceKind.NODE:
         return OpenedSource(None, None)
     if choice.kind is SourceKind.DEVICE:
         device = choice.device.strip()
-        return OpenedSource(CaptureDevice(int(device) if device.isdigit() else device), None)
+        size_px = (camera.width, camera.height) if camera else None
+        return OpenedSource(CaptureDevice(int(device) if device.isdigit() else device, size_px), None)
     path = Path(choice.path)
     suffix = path.suffix.lower()
     if path.is_dir():
         return OpenedSource(ImageFiles(path, choice.rate_hz, choice.repeat, choice.only_new), None)
     if suffix == ".json":
-        camera, images, given = given_poses(path)
+        named, images, given = given_poses(path)
         video = poses_of_video(given)
         if video is not None:
-            return OpenedSource(VideoFile(video[0], choice.repeat, given=video[1]), camera)
-        return OpenedSource(ImageFiles(images, choice.rate_hz, choice.repeat, given=given), camera, len(images) == 1)
+            return OpenedSource(VideoFile(video[0], choice.repeat, given=video[1]), named)
+        return OpenedSource(ImageFiles(images, choice.rate_hz, choice.repeat, given=given), named, len(images) == 1)
     if suffix in VIDEO_SUFFIXES:
         return OpenedSource(VideoFile(path, choice.repeat), None)
     if suffix in IMAGE_SUFFIXES:

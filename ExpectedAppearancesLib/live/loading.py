@@ -29,8 +29,8 @@ def load(
     choice: Choice, case: Case | None = None, overlays: OverlayMaker | None = None, model: OpenedModel | None = None
 ) -> Loaded:
     """Read what was chosen, but for what is given. Raises InputError with what is wrong."""
-    source = open_source(choice)
     opened = Case.open(choice.case_path)
+    source = open_source(choice, opened.camera)
     if case is None or overlays is None or _inputs(opened) != _inputs(case):  # made again in the same folder
         case = opened
         case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now

@@ -217,10 +217,15 @@ class VideoFile:
 
 
 class CaptureDevice:
-    """A camera or frame grabber by its number, or the address of a network stream; the newest frame each time."""
+    """A camera or frame grabber by its number, or the address of a network stream; the newest frame each time.
 
-    def __init__(self, device: int | str, clock: Callable[[], float] = time.monotonic):
-        self._device, self._clock = device, clock
+    size_px: width and height that it is asked for; it may have others.
+    """
+
+    def __init__(
+        self, device: int | str, size_px: tuple[int, int] | None = None, clock: Callable[[], float] = time.monotonic
+    ):
+        self._device, self._size_px, self._clock = device, size_px, clock
         self.dropped = 0
         self.can_wait = False
         self._number = 0
@@ -236,6 +241,9 @@ class CaptureDevice:
                 f"capture device {self._device}: cannot be opened; check that it is plugged in and that no other "
                 "program uses it."
             )
+        if self._size_px is not None:  # drivers start with 640 x 480, whatever they can
+            self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size_px[0])
+            self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size_px[1])
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # without it some drivers hand out frames that are long past
 
     def read(self) -> LiveFrame | None:
