@@ -116,6 +116,34 @@ def test_outline_lies_within_a_pixel_of_the_projected_silhouette(application, ca
     assert same[~cv2.dilate(drawn.astype(np.uint8), np.ones((3, 3))).astype(bool)].mean() > 0.999
 
 
+def test_frame_and_outline_hold_when_the_models_are_deformed(application, case):
+    """As for brain shift: the camera does not hang under what has no matrix."""
+    import vtk
+
+    scene, _logic = application
+    view, live, _result = shown(application, case)
+    warp = vtk.vtkThinPlateSplineTransform()
+    ends = [vtk.vtkPoints(), vtk.vtkPoints()]
+    for number, at in enumerate(((0, 0, 0), (50, 0, 0), (0, 50, 0), (0, 0, 50), (50, 50, 50))):
+        ends[0].InsertNextPoint(*at)
+        ends[1].InsertNextPoint(at[0] + 3 * number, at[1] - 2, at[2] + 30)
+    warp.SetSourceLandmarks(ends[0])
+    warp.SetTargetLandmarks(ends[1])
+    warp.SetBasisToR()
+    node = scene.AddNewNodeByClass("vtkMRMLTransformNode", "Brain shift")
+    node.SetAndObserveTransformToParent(warp)
+    for model in live.models.values():
+        model.SetAndObserveTransformNodeID(node.GetID())
+    result = result_of(case, OTHER_POSE, seed=1)
+    live.show(result)
+    draw(view, live)
+    pixels = view.pixels()
+    drawn = is_colour(pixels, PREDICTED_RGB)
+    far_px, near_px = apart(case, OTHER_POSE, CAMERA, drawn)
+    assert drawn.sum() > 500 and far_px.max() <= 1.0 and near_px.max() < 1.5
+    assert (np.abs(pixels.astype(int) - result.image_rgb).max(axis=2) <= 1).mean() > 0.9
+
+
 def test_outline_and_view_hold_when_the_user_transforms_the_models(application, case):
     import vtk
 

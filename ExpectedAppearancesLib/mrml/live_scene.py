@@ -101,10 +101,12 @@ class LiveScene:
         return matrix_of(self.transform, to_world=True)
 
     def follow_models(self) -> None:
-        """Hang camera and frame under the transform that the user put the vessels under, if any."""
+        """Hang camera and frame under the linear transform that the user put the vessels under, if any."""
         parent = self.models[scenes.VESSELS].GetParentTransformNode()
         if parent is not None and parent.GetAttribute(ROLE_ATTRIBUTE):
             return  # the handles of the alignment: then the vessels move and the camera does not
+        if parent is not None and not parent.IsTransformToWorldLinear():
+            parent = None  # a camera cannot be deformed
         if self.transform.GetParentTransformNode() is not parent:
             self.transform.SetAndObserveTransformNodeID(parent.GetID() if parent is not None else None)
 
