@@ -86,6 +86,10 @@ class AlignSection:
         if self._start is None:
             return
         wanted = np.concatenate(self._controller.nudges(self._start))
+        if any(abs(value) > slider.maximum for slider, value in zip(self._sliders, wanted)):
+            # Landmarks and handles go farther than sliders, which begin anew there: the next touch must not go back.
+            self._start = self._controller.alignment.camera_from_world
+            wanted = np.zeros(6)
         if np.abs(wanted - [slider.value for slider in self._sliders]).max() < 0.06:
             return
         self._moving_sliders = True

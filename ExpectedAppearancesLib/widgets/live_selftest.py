@@ -11,6 +11,7 @@ import numpy as np
 import slicer
 
 from ..evaluation.metrics import add_mm
+from ..live.alignment import nudged
 from ..live.trust import Sight
 from ..mrml.live_record import frame_at
 from ..runs import dependencies
@@ -158,7 +159,7 @@ def aligns_by_hand(test) -> None:
     if not registration_is_installed(test):
         return
     with tempfile.TemporaryDirectory() as folder:
-        _phantom, widget = started(Path(folder))
+        phantom, widget = started(Path(folder))
         next_result(test, widget)
         widget.ui.freezeButton.click()
         pump(0.2)
@@ -169,6 +170,14 @@ def aligns_by_hand(test) -> None:
         difference = widget.panel.controller.difference()
         if widget.panel.controller.result.accepted:
             test.assertAlmostEqual(difference.add_mm, 4.0, places=1)
+        alignment, centre_mm = widget.panel.controller.alignment, phantom.case.vessels.centroid_mm
+        far = nudged(alignment.camera_from_world, centre_mm, np.array([0, 0, 300.0]), np.array([0, 0, 120.0]))
+        alignment.set_pose(far)  # by landmarks or handles: farther than the sliders go
+        pump(0.2)
+        widget.ui.shiftXSlider.value = 2.0
+        pump(0.2)
+        expected = nudged(far, centre_mm, np.array([2.0, 0, 0]), np.zeros(3))
+        np.testing.assert_allclose(alignment.camera_from_world, expected, atol=0.1)
         widget.ui.alignButton.checked = False
         pump(0.2)
         test.assertIn("ADD", widget.ui.differenceLabel.text)
