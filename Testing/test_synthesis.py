@@ -298,8 +298,17 @@ def test_targets_are_made_once_for_a_texture_and_only_few_are_kept(vgg, monkeypa
         synthesizer.run([Job(label_map(), texture("a"), seed)])
     assert len(calls) == 1
     for i in range(20):
-        synthesizer.targets.of(texture(f"t{i}"), 32, 32)
+        synthesizer.targets.of(texture(f"t{i}", (10 * i, 0, 0)), 32, 32)
     assert len(synthesizer.targets._kept) <= 4
+
+
+def test_a_texture_is_known_by_its_content_not_by_its_name(vgg):
+    """A worker of a cluster goes on living when a texture has been corrected, or serves a patient with others."""
+    first, corrected = texture("a"), texture("a", (30, 200, 40))
+    measure = GramMeasure(vgg)
+    measure.distances(first.image, first.labels, first)
+    distances = measure.distances(corrected.image, corrected.labels, corrected)
+    assert max(distances.values()) < 1e-6, "compared with the texture that was called so before"
 
 
 def test_operations_are_those_of_the_layers():

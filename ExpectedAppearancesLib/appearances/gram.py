@@ -201,7 +201,7 @@ class TargetGrams:
 
     def of(self, texture: Texture, height: int, width: int) -> list[torch.Tensor]:
         """As `texture_grams` gives them, for CLASSES, on the weights' device."""
-        key = (texture.name, height, width)
+        key = (texture.sha256, height, width)  # another one may be called alike: a cluster's workers serve many runs
         if key not in self._kept:
             image, labels = resized(texture, height, width)
             device = self._vgg.conv1_1_weight.device

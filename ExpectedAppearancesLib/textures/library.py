@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ class Texture:
     image: np.ndarray
     labels: np.ndarray
 
-    @property
+    @cached_property
     def sha256(self) -> str:
         """Of image and labels: what appearances made from the texture depend on."""
         return hashlib.sha256(self.image.tobytes() + self.labels.tobytes()).hexdigest()
