@@ -311,6 +311,18 @@ def test_a_texture_is_known_by_its_content_not_by_its_name(vgg):
     assert max(distances.values()) < 1e-6, "compared with the texture that was called so before"
 
 
+def test_memory_does_not_grow_with_the_sizes_of_textures(vgg):
+    """Photographs are cropped by hand: each has a size of its own."""
+    measure = GramMeasure(vgg)
+    kept = []
+    for width in (48, 40, 33):
+        t = texture("a", size=48)
+        labels = np.ascontiguousarray(t.labels[:, :width])
+        measure.distances(np.ascontiguousarray(t.image[:, :width]), labels, t)
+        kept.append(len(vgg._packed))
+    assert kept[0] == kept[-1]
+
+
 def test_operations_are_those_of_the_layers():
     """By hand for VGG-16 at 32 px, one class on a quarter of the pixels."""
     convolutions = (

@@ -42,7 +42,8 @@ class VggFeatures(torch.nn.Module):
                     f"{name}_{key}", value.contiguous(memory_format=torch.channels_last), persistent=False
                 )
             self.register_buffer(f"{name}_bias", weights[f"{name}.bias"].to(compute_dtype), persistent=False)
-        self._packed: dict[tuple, torch.Tensor] = {}
+        # Of the newest size only: each photograph's is another, and all weights once more take tens of MB.
+        self._packed: dict[tuple[str, str], tuple[torch.Size, torch.Tensor]] = {}
 
     def forward(self, image: torch.Tensor) -> list[torch.Tensor]:
         return [x for name, x in zip(self.names, self.activations(image)) if name.endswith("_1")]
@@ -93,16 +94,15 @@ class VggFeatures(torch.nn.Module):
         weight = getattr(self, f"{name}_{key}")
         bias = getattr(self, f"{name}_bias") if key == "weight" else None
         if x.device.type == "cpu" and _can_pack():
-            packed_key = (name, key, x.shape[2:])
-            if packed_key not in self._packed:
+            size, packed = self._packed.get((name, key), (None, None))
+            if size != x.shape[2:]:
                 # Packed for one image: for another batch oneDNN could choose another blocking, so other roundings.
-                self._packed[packed_key] = torch._C._nn.mkldnn_reorder_conv2d_weight(
+                packed = torch._C._nn.mkldnn_reorder_conv2d_weight(
                     weight.to_mkldnn(), [1, 1], [1, 1], [1, 1], 1, [1, *x.shape[1:]]
                 )
+                self._packed[name, key] = x.shape[2:], packed
             after = "relu" if relu else "none"
-            return torch.ops.mkldnn._convolution_pointwise(
-                x, self._packed[packed_key], bias, [1, 1], [1, 1], [1, 1], 1, after, [], ""
-            )
+            return torch.ops.mkldnn._convolution_pointwise(x, packed, bias, [1, 1], [1, 1], [1, 1], 1, after, [], "")
         x = F.conv2d(x, weight, bias, padding=1)
         return x.relu_() if relu else x
 
