@@ -121,3 +121,15 @@ def test_exposed_vessels_are_those_above_the_parenchyma_whichever_way_its_triang
         x, y, z = part.vertices_mm.T
         assert (z > -4.0 * (x**2 + y**2) / 20**2 - 0.12).all()  # the dome's own formula; its cells are flat
         assert 0.2 < len(part.triangles) / len(vessels().triangles) < 1.2
+
+
+def test_vessels_on_a_closed_segment_are_exposed_above_it():
+    """A segment's surface has an under side too, here in finer triangles."""
+    top, under = dome(), dome(cells=48)
+    closed = Mesh(
+        np.vstack([top.vertices_mm, under.vertices_mm - [0, 0, 12]]),
+        np.vstack([top.triangles, under.triangles[:, ::-1] + len(top.vertices_mm)]),
+    )
+    part = exposed_vessels(vessels(), closed, np.array([0, 0, 1.0]))
+    alone = exposed_vessels(vessels(), top, np.array([0, 0, 1.0]))
+    np.testing.assert_array_equal(part.vertices_mm, alone.vertices_mm)

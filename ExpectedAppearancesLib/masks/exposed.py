@@ -15,8 +15,9 @@ def exposed_vessels(vessels: Mesh, parenchyma: Mesh, outward_axis: np.ndarray) -
     surface = vtkImplicitPolyDataDistance()
     surface.SetInput(parenchyma.to_polydata())
     height_mm = np.array([surface.EvaluateFunction(vertex) for vertex in vessels.vertices_mm])
-    # The sign follows the mesh's normals; which way they point is known from the axis alone.
-    if (parenchyma.vertex_normals() @ outward_axis).mean() < 0:
+    # The sign follows the mesh's normals. Which way they point tells a place that is outside for certain: their mean
+    # does not where the surface is closed, as a segment's is.
+    if surface.EvaluateFunction(vessels.centroid_mm + outward_axis * vessels.radius_mm) < 0:
         height_mm = -height_mm
     if not (height_mm > 0).any():
         return vessels
