@@ -19,6 +19,7 @@ from ExpectedAppearancesLib.evaluation.metrics import frame_errors
 from ExpectedAppearancesLib.evaluation.report import headline, text_table
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
 
 CAMERA = Camera(96, 96, 180.0, 180.0, 47.5, 47.5, (0.0,) * 5)
@@ -114,6 +115,24 @@ def test_overlay_shows_true_outline_green_and_predicted_blue_where_they_project(
         rows, columns = np.nonzero((np.abs(tile - colour).sum(2) < 30)[: big.height])
         np.testing.assert_allclose((columns.min(), rows.min()), corners.min(0), atol=4)
         np.testing.assert_allclose((columns.max(), rows.max()), corners.max(0), atol=4)
+
+
+def test_overlay_without_a_cortex_hides_nothing_behind_a_disc_on_the_wrong_side(known, tmp_path):
+    """Vessels that lie in a plane do not tell which side is out; `render --normal` did."""
+    vessels, _ = ribbon_and_plane()
+    write_vtp(tmp_path / "v.vtp", vessels)
+    for side in (1.0, -1.0):
+        case = Case.create(tmp_path / f"case{side}", tmp_path / "v.vtp", None, CAMERA)
+        craniotomy = find_craniotomy(case.vessels, normal=[0, 0, side])
+        case.record("render", craniotomy={key: np.asarray(value).tolist() for key, value in vars(craniotomy).items()})
+        frames = [frame.to_dict() for frame in read_poses(known)[1]]
+        if side < 0:  # the same views from below
+            turn = np.diag([1.0, -1.0, -1.0, 1.0])
+            frames = [f | {"camera_from_world": f["camera_from_world"] @ turn} for f in frames]
+        write_poses(tmp_path / "poses.json", CAMERA, frames)
+        evaluate(case, tmp_path / "poses.json", tmp_path / "out", predicted_path=tmp_path / "poses.json")
+        for path in (tmp_path / "out" / "overlays").glob("*.png"):
+            assert (np.abs(files.read_image_rgb(path).astype(int) - overlays.PREDICTED_RGB).sum(2) < 30).any(), path
 
 
 def test_report_is_one_file_with_escaped_names_and_embedded_figures(case, known, tmp_path):

@@ -199,12 +199,10 @@ def overlay_images(case: Case, evaluation: Evaluation, indices: Iterable[int]) -
     import cv2
 
     from ..masks.renderer import MaskRenderer
-    from ..poses.craniotomy import disc_under_vessels, find_craniotomy
+    from ..masks.stage import craniotomy_of, parenchyma_of
     from .overlays import draw_overlay, undistorted, with_caption
 
-    parenchyma = case.cortex or disc_under_vessels(
-        case.vessels, find_craniotomy(case.vessels, None, case.space).outward_axis
-    )
+    parenchyma = parenchyma_of(case, craniotomy_of(case))
     renderers: dict[Camera, MaskRenderer] = {}
     results = []
     try:
