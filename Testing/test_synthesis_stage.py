@@ -16,7 +16,7 @@ from ExpectedAppearancesLib.appearances.stage import synthesize_case
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
-from ExpectedAppearancesLib.masks.stage import render_case
+from ExpectedAppearancesLib.masks.stage import read_rendered, render_case
 from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 from ExpectedAppearancesLib.textures.library import list_textures, shipped_textures_folder
 
@@ -75,6 +75,20 @@ def test_a_changed_texture_or_axis_is_not_passed_over(case):
     render_case(case, lambda *_: None, 3, craniotomy=find_craniotomy(case.vessels, normal=[0.3, 0, 1]))
     third = made([texture("a"), texture("b", (10, 200, 10))])
     assert third["a"] != second["a"] and third["b"] != second["b"]
+
+
+def test_label_maps_of_an_interrupted_drawing_are_not_taken_for_the_views_of_the_poses_before(case):
+    def cancel_in_last(fraction, _message):
+        if fraction > 0.9:
+            raise CancelledError("stop")
+
+    with pytest.raises(CancelledError):
+        render_case(case, cancel_in_last, poses=4, seed=1)
+    assert len(list(case.masks_folder.glob("*.png"))) == 4
+    with pytest.raises(InputError, match="run `render`"):
+        synthesize_case(case, [texture("a")], lambda *_: None, "image", size_px=32, iterations=1)
+    render_case(case, lambda *_: None, poses=4, seed=1)
+    assert len(read_rendered(case)) == 4
 
 
 def test_paper_preset_makes_every_pose_with_every_texture(case):

@@ -83,8 +83,9 @@ def render_case(
     }
     settings = json.loads(json.dumps(settings))
     if _without_count(case.manifest["stages"].get("render")) != _without_count(settings):
-        for stale in case.masks_folder.glob("*.png"):
-            stale.unlink()
+        # The poses first: new label maps must not be taken for what the old poses see.
+        for stale in (case.poses_path, *case.masks_folder.glob("*.png")):
+            stale.unlink(missing_ok=True)
     case.record("render", **settings, done=False)
     with MaskRenderer(case.vessels, parenchyma_of(case, craniotomy), case.camera, circular_field) as renderer:
         for i, matrix in enumerate(matrices):
