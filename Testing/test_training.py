@@ -1,3 +1,4 @@
+import contextlib
 import json
 import os
 import signal
@@ -8,6 +9,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from cases import camera, write_inputs
@@ -327,6 +329,45 @@ def test_a_cancelled_training_loses_no_step(case, tmp_path, number):
         assert process.wait(120) == 3
         assert len(steps()) >= wanted and training_state(path)["step"] == steps()[-1]
     assert steps() == list(range(1, len(steps()) + 1))  # none again, none left out
+
+
+# Draws views until nobody takes any more, and says who draws them.
+DRAWER = """
+import sys, time
+from ExpectedAppearancesLib.model.feeder import Feeder
+from ExpectedAppearancesLib.model.views import ViewSettings
+
+if __name__ == "__main__":
+    settings = ViewSettings("surface", 64, ("a", "b"), True, 0.0, 0.0, 5)
+    with Feeder(sys.argv[1], settings, 1) as feeder:
+        while not feeder._queues[0].full():
+            time.sleep(0.02)
+        print(feeder._processes[0].pid, flush=True)
+        time.sleep(600)
+"""
+
+
+def test_views_are_drawn_for_nobody_once_their_training_is_killed(case, tmp_path):
+    (tmp_path / "drawer.py").write_text(DRAWER)
+    command = [sys.executable, str(tmp_path / "drawer.py"), str(case.folder)]
+    process = subprocess.Popen(command, env=library_environment(), stdout=subprocess.PIPE, text=True)
+    drawing = psutil.Process(int(process.stdout.readline()))
+    process.kill()
+    process.wait()
+    try:
+        drawing.wait(120)
+    finally:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            drawing.kill()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_ctrl_c_leaves_a_training_the_views_of_the_step_it_is_in(case):
+    """In a terminal it reaches the processes that draw, too."""
+    with Feeder(case.folder, settings("surface"), 1) as feeder:
+        feeder.next()
+        os.kill(feeder._processes[0].pid, signal.SIGINT)
+        assert len([feeder.next() for _ in range(20)]) == 20  # more than had been drawn by then
 
 
 def test_a_damaged_checkpoint_is_not_gone_on_from(trained):

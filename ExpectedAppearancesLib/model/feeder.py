@@ -6,10 +6,12 @@ processes use two cores.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import multiprocessing
 import os
 import queue
+import signal
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,7 @@ from .views import ViewSettings
 
 QUEUE_BATCHES = 6
 TIMEOUT_S = 300.0
+ORPHAN_LOOKS_S = 2.0  # how often a process whose views nobody takes looks whether anybody is left
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
 
 
@@ -46,7 +49,7 @@ class Feeder:
         self._processes = [
             context.Process(
                 target=_serve,
-                args=(str(case_folder), settings, batch, first_batch + k, workers, own, os.getpid()),
+                args=(str(case_folder), settings, batch, first_batch + k, workers, own),
                 daemon=True,
             )
             for k, own in enumerate(self._queues)
@@ -128,9 +131,9 @@ def draw_views(case_folder: Path, settings: ViewSettings, count: int, workers: i
     return Batch(*(np.concatenate(parts)[:count] for parts in zip(*(vars(batch).values() for batch in drawn))))
 
 
-def _serve(
-    case_folder: str, settings: ViewSettings, batch: int, first_batch: int, stride: int, out, parent: int
-) -> None:
+def _serve(case_folder: str, settings: ViewSettings, batch: int, first_batch: int, stride: int, out) -> None:
+    # Ctrl+C reaches this process as well, but it is for who takes the views to say when there are enough.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         import cv2
 
@@ -139,19 +142,27 @@ def _serve(
         cv2.setNumThreads(1)
         source = ViewSource(Path(case_folder), settings)
         number = first_batch
-        while os.getppid() == parent:  # an orphan would render for nobody
+        while True:
             views = [source.view(number * batch + i) for i in range(batch)]
-            out.put(
-                (
-                    np.stack([v.image for v in views]),
-                    np.stack([v.camera_from_world for v in views]),
-                    np.stack([v.points_mm for v in views]),
-                    np.stack([v.surface for v in views]),
-                    np.stack([v.vessels for v in views]),
-                )
+            drawn = (
+                np.stack([v.image for v in views]),
+                np.stack([v.camera_from_world for v in views]),
+                np.stack([v.points_mm for v in views]),
+                np.stack([v.surface for v in views]),
+                np.stack([v.vessels for v in views]),
             )
+            if not _given(out, drawn):
+                return
             number += stride
-    except KeyboardInterrupt:
-        pass
     except BaseException:  # the training process must learn of it, whatever it is
         out.put(traceback.format_exc())
+
+
+def _given(out, drawn: tuple[np.ndarray, ...]) -> bool:
+    """Puts the batch in; False where nobody is left to take it."""
+    while multiprocessing.parent_process().is_alive():
+        with contextlib.suppress(queue.Full):
+            out.put(drawn, timeout=ORPHAN_LOOKS_S)
+            return True
+    out.cancel_join_thread()  # what was put in before would be waited for
+    return False
