@@ -25,6 +25,7 @@ from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, ExpectedAppearancesError, InputError
 from ExpectedAppearancesLib.evaluation import study, study_folds
 from ExpectedAppearancesLib.evaluation.verdict import figures_of_study
+from ExpectedAppearancesLib.geometry.camera import write_camera
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
 from ExpectedAppearancesLib.registration.predictor import Prediction
@@ -182,6 +183,19 @@ def test_a_finished_fold_is_trained_again_only_when_what_it_depends_on_changed(s
     assert len(calls(studied)) == 10 and calls(studied)[9][calls(studied)[9].index("--exclude") + 1] == "b"
     run(studied, replace(both, steps=6))
     assert len(calls(studied)) == 16
+
+
+def test_frames_are_registered_anew_when_the_camera_beside_their_poses_was_corrected(studied, no_pictures, monkeypatch):
+    """As intrinsics are that were wrong at first; the poses file itself, which names their file, stays the same."""
+    told = []
+    usual = ShiftedPredictor.predict
+    monkeypatch.setattr(ShiftedPredictor, "predict", lambda *a: told.append(a[2].fx) or usual(*a))
+    camera_path = studied.poses.parent / "camera.json"
+    studied.poses.write_text(json.dumps(json.loads(studied.poses.read_text()) | {"camera": camera_path.name}))
+    for fx in (180.0, 190.0, 190.0):
+        write_camera(camera_path, replace(camera(), fx=fx))
+        run(studied)
+    assert told == [180.0] * 9 + [190.0] * 9 and len(calls(studied)) == 3
 
 
 def test_later_parts_are_added_to_the_study_and_other_inputs_begin_a_new_one(studied, no_pictures):

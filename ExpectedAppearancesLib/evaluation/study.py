@@ -316,6 +316,7 @@ def _registered(one: StudyCase, job: FoldJob, frames: list[Frame]) -> list[Frame
     """Frames as the fold's model sees them; what was registered before with the same model is read again."""
     path, made_of = job.folder / "predicted.json", job.folder / "predicted.of.json"
     of = {"model_sha256": files.sha256(job.folder / "model.onnx"), "poses_sha256": one.inputs["poses_sha256"]}
+    of["camera"] = one.camera.to_dict()  # may lie in a file of its own
     if path.is_file() and made_of.is_file() and files.read_json(made_of, "record of predictions") == of:
         by_image = {frame.image: frame for frame in read_poses(path)[1]}
         if all(frame.image in by_image for frame in frames):
