@@ -8,7 +8,7 @@ from ExpectedAppearancesLib.case.meshes import Mesh
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.pose import inverse, is_rigid
 from ExpectedAppearancesLib.poses import sampling
-from ExpectedAppearancesLib.poses.craniotomy import Craniotomy, disc_under_vessels, find_craniotomy
+from ExpectedAppearancesLib.poses.craniotomy import Craniotomy, disc_under_vessels, find_craniotomy, is_closed
 from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
 
 TURN = Rotation.from_euler("xyz", [40, -65, 20], degrees=True).as_matrix()
@@ -22,6 +22,28 @@ def turned(mesh: Mesh, inside_out: bool = False) -> Mesh:
 def test_outward_axis_is_found_from_the_cortex_whatever_its_triangle_order(inside_out):
     found = find_craniotomy(turned(vessels()), turned(dome(), inside_out))
     assert np.degrees(np.arccos(found.outward_axis @ TURN[:, 2])) < 2
+
+
+def ball(radius_mm: float = 70.0, cells: int = 24) -> Mesh:
+    """Closed and round, as a segmented brain, but flatter from side to side; its triangles face outwards."""
+    z = np.linspace(1, -1, cells + 1)[:, None]
+    angle = np.linspace(0, 2 * np.pi, cells, endpoint=False)
+    across = np.sqrt(1 - z**2)
+    points = np.stack([0.8 * across * np.cos(angle), across * np.sin(angle), z + 0 * angle], axis=-1)
+    row, column = (index.ravel() for index in np.mgrid[:cells, :cells])
+    a, b = row * cells + column, row * cells + (column + 1) % cells
+    triangles = np.vstack([np.stack([a, a + cells, b], 1), np.stack([b, a + cells, b + cells], 1)])
+    return Mesh(radius_mm * points.reshape(-1, 3), triangles)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_outward_axis_on_a_closed_brain_is_where_its_vessels_lie(side):
+    """The flattest direction of the whole brain is from ear to ear, and which ear nobody could tell."""
+    brain = ball()
+    on_top = Mesh((vessels().vertices_mm + np.array([0, 0, 70])) * [side, 1, side], vessels().triangles)
+    found = find_craniotomy(turned(on_top), turned(brain))
+    assert np.degrees(np.arccos(found.outward_axis @ (TURN @ [0, 0, side]))) < 12
+    assert is_closed(brain) and not is_closed(dome())
 
 
 def test_outward_axis_is_fitted_to_the_vessels_where_there_is_no_cortex():

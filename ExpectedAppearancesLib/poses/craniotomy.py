@@ -9,6 +9,8 @@ import numpy as np
 from ..case.meshes import Mesh
 from ..errors import InputError
 
+CLOSED_SHARE = 0.05  # a surface that faces one way by less is closed, but for small holes
+
 
 @dataclass(frozen=True)
 class Craniotomy:
@@ -34,7 +36,7 @@ def find_craniotomy(
     if normal is not None:
         axis = np.asarray(normal, float)
     elif cortex is not None:
-        axis = _axis_of_cortex(cortex)
+        axis = _axis_of_cortex(cortex, vessels)
     else:
         axis = _axis_of_vessels(vessels)
     length = np.linalg.norm(axis)
@@ -68,15 +70,30 @@ def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray, segments: int = 
     return Mesh(np.vstack([centre, rim]), triangles)
 
 
-def _axis_of_cortex(cortex: Mesh) -> np.ndarray:
+def is_closed(cortex: Mesh) -> bool:
+    """Whether the surface faces all ways alike, as that of a whole brain or of a segment: it has no axis of its own."""
+    return _one_way(cortex)[1] < CLOSED_SHARE
+
+
+def _axis_of_cortex(cortex: Mesh, vessels: Mesh) -> np.ndarray:
     """Area-weighted mean normal. Triangle order may be inside out, so the sign comes from the surface's bulge."""
-    corners = cortex.vertices_mm[cortex.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    mean = normals.sum(axis=0)
-    if np.linalg.norm(mean) < 0.3 * np.linalg.norm(normals, axis=1).sum():
-        # Mixed or closed: the flattest direction is what is left.
+    mean, share = _one_way(cortex)
+    if share < CLOSED_SHARE:
+        # Which side is out is where the vessels lie on it.
+        axis = _flattest_direction(vessels.vertices_mm)
+        return axis if axis @ (vessels.centroid_mm - cortex.centroid_mm) > 0 else -axis
+    if share < 0.3:
+        # Mixed: the flattest direction is what is left.
         mean = _flattest_direction(cortex.vertices_mm)
     return _towards_bulge(mean, cortex.vertices_mm)
+
+
+def _one_way(mesh: Mesh) -> tuple[np.ndarray, float]:
+    """Area-weighted sum of the triangles' normals (3,), and its share, 0..1, of what it is where all face one way."""
+    corners = mesh.vertices_mm[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = normals.sum(axis=0)
+    return total, float(np.linalg.norm(total) / max(np.linalg.norm(normals, axis=1).sum(), 1e-12))
 
 
 def _axis_of_vessels(vessels: Mesh) -> np.ndarray:
