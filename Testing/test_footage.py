@@ -15,7 +15,7 @@ from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.model.encoding import fit_encoding
 from ExpectedAppearancesLib.registration import predictor as predictor_module
 from ExpectedAppearancesLib.registration.footage import Footage
-from ExpectedAppearancesLib.registration.poses_file import read_poses
+from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
 from ExpectedAppearancesLib.registration.predictor import Prediction
 
 LEVELS = range(20, 240, 11)  # grey level of each frame of the test video
@@ -136,6 +136,21 @@ def test_register_without_track_is_as_before(case, video, tmp_path):
     assert main(["register", str(case.folder), str(video), "--out", str(out)]) == 0
     first = json.loads(out.read_text())["frames"][0]
     assert "tracking" not in first and first["image"] == "Op ä.avi#frame=0" and first["time_s"] == 0
+
+
+def test_frames_of_a_video_can_be_evaluated(case, video, tmp_path):
+    registered, known = tmp_path / "registered.json", tmp_path / "known.json"
+    assert main(["register", str(case.folder), str(video), "--out", str(registered)]) == 0
+    stored_camera, frames = read_poses(registered)
+    write_poses(known, stored_camera, [{"image": f.image, "camera_from_world": f.camera_from_world} for f in frames])
+    out = tmp_path / "out"
+    compare = ["evaluate", str(case.folder), "--poses", str(known), "--predicted", str(registered), "--out", str(out)]
+    assert main(compare) == 0
+    assert json.loads((out / "metrics.json").read_text())["add_mm"]["mean"] == 0
+    overlays = [path.name for path in (out / "overlays").glob("*.png")]
+    assert len(overlays) == 12 and "00_Op ä#frame=0.png" in overlays
+    video.unlink()
+    assert main(compare) == 2
 
 
 def test_tracking_of_images_needs_their_rate_and_a_model_with_covariance(case, tmp_path, capsys, monkeypatch):

@@ -13,6 +13,7 @@ from .. import files
 from ..case.case import Case
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera
+from ..registration.footage import FRAME_MARK, is_there
 from ..registration.poses_file import Frame, read_poses, write_poses
 from ..registration.record import frame_record
 from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics, reliability
@@ -120,7 +121,7 @@ def known_frames(path: Path, styles: Sequence[str] | None, case_camera: Camera) 
     for frame in frames:
         if frame.camera_from_world is None:
             problems.add(f"{path}: {frame.image.name} has no camera_from_world; evaluation needs the known pose.")
-        if not frame.image.is_file():
+        if not is_there(frame.image):
             problems.add(f"{frame.image}: image not found; {path.name} names it relative to its own folder.")
     problems.raise_if_any()
     return camera or case_camera, frames
@@ -189,7 +190,7 @@ def _write_overlays(case: Case, evaluation: Evaluation, folder: Path) -> None:
     tiles = []
     for rank, (index, tile) in enumerate(zip(chosen, overlay_images(case, evaluation, chosen))):
         style = f"{evaluation.true[index].style}_" if evaluation.true[index].style else ""
-        files.write_png(folder / "overlays" / f"{rank:02d}_{style}{evaluation.true[index].image.stem}.png", tile)
+        files.write_png(folder / "overlays" / f"{rank:02d}_{style}{_name(evaluation.true[index].image)}.png", tile)
         tiles.append(tile)
     files.write_png(folder / "overlays.png", sheet(tiles))
 
@@ -225,9 +226,14 @@ def overlay_images(case: Case, evaluation: Evaluation, indices: Iterable[int]) -
     return results
 
 
+def _name(image: Path) -> str:
+    """The file's without its suffix, which holds the number in VIDEO.avi#frame=N."""
+    return f"{image.stem}{''.join(image.suffix.partition(FRAME_MARK)[1:])}"
+
+
 def _caption(evaluation: Evaluation, index: int) -> str:
     true, predicted, errors = evaluation.true[index], evaluation.predicted[index], evaluation.errors
-    name = f"{true.style}/{true.image.stem}" if true.style else true.image.stem
+    name = f"{true.style}/{_name(true.image)}" if true.style else _name(true.image)
     if predicted.camera_from_world is None:
         return f"{name}: refused, no pose"
     refused = "" if predicted.accepted else " (refused)"

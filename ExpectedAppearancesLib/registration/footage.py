@@ -97,6 +97,11 @@ class Footage:
             raise InputError(f"{path}: no frame of this video can be read; save it again as MP4 (H.264) or AVI.")
 
 
+def is_there(image: Path) -> bool:
+    """Whether the file of a frame is there; for VIDEO#frame=N that of the video."""
+    return image.is_file() or (FRAME_MARK in image.name and Path(str(image).rpartition(FRAME_MARK)[0]).is_file())
+
+
 def read_video_frame(path: Path) -> np.ndarray:
     """The frame that a path VIDEO#frame=N names, uint8 RGB (H, W, 3). Raises InputError."""
     import cv2
