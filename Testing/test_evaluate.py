@@ -21,6 +21,7 @@ from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
 from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
+from ExpectedAppearancesLib.registration.predictor import fitted_camera
 
 CAMERA = Camera(96, 96, 180.0, 180.0, 47.5, 47.5, (0.0,) * 5)
 STYLES = ("day", "night")
@@ -197,6 +198,18 @@ def test_damaged_images_are_all_named(case, known, tmp_path):
         evaluate(case, known, tmp_path / "out", predictor=ShiftedPredictor(known))
     assert len(caught.value.problems) == 2 and str(images[2]) in caught.value.problems[1]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_frame_that_does_not_fit_the_camera_is_named(case, known, tmp_path):
+    class OfOneSize(ShiftedPredictor):
+        def predict(self, image_rgb, camera):
+            fitted_camera(camera, *image_rgb.shape[1::-1])
+            return super().predict(image_rgb, camera)
+
+    files.write_png(tmp_path / "data" / "night" / "1.png", np.full((96, 128, 3), 90, np.uint8))
+    with pytest.raises(InputError, match=r"1\.png: the frame is 128 x 96 px") as error:
+        evaluate(case, known, tmp_path / "out", predictor=OfOneSize(known))
+    assert len(error.value.problems) == 1
 
 
 def test_curve_points_rise_to_the_share_that_has_a_pose():

@@ -142,7 +142,11 @@ def register_frames(true: list[Frame], camera: Camera, predictor, progress: Prog
     predicted, problems = [], Problems()
     for i, frame in enumerate(true):
         with problems.collect():
-            prediction = predictor.predict(files.read_image_rgb(frame.image), camera)
+            image = files.read_image_rgb(frame.image)
+            try:
+                prediction = predictor.predict(image, camera)
+            except InputError as error:
+                raise InputError(f"{frame.image}: {error}") from error
             record = frame_record(frame.image, prediction)
             extra = {key: value for key, value in record.items() if key not in ("image", "camera_from_world")}
             predicted.append(Frame(frame.image, prediction.camera_from_world, frame.style, extra))
