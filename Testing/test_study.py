@@ -28,7 +28,7 @@ from ExpectedAppearancesLib.evaluation.verdict import figures_of_study
 from ExpectedAppearancesLib.geometry.camera import write_camera
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
-from ExpectedAppearancesLib.registration.predictor import Prediction
+from ExpectedAppearancesLib.registration.predictor import Prediction, Predictor
 from ExpectedAppearancesLib.runs.environment import library_environment
 
 SHIFT_MM = {"a": 1.0, "b": 2.0, "c": 4.0}
@@ -321,6 +321,15 @@ def test_all_problems_at_once_and_nothing_trained(studied, tmp_path, capsys):
     write_poses(studied.poses, camera_of, [f.to_dict() | {"style": "elsewhere"} for f in frames])
     with pytest.raises(InputError, match="called like a texture"):
         run(studied)
+
+
+def test_a_model_that_cannot_be_tested_for_robustness_is_told_before_anything_is_trained(studied, monkeypatch):
+    monkeypatch.setattr("ExpectedAppearancesLib.registration.predictor.Predictor", Predictor)
+    files.write_json(studied.case / "model" / "model.json", {"format_version": 1})
+    files.write_bytes(studied.case / "model" / "model.onnx", b"")
+    with pytest.raises(InputError, match="older version"):
+        run(studied, replace(QUICK, robustness=True))
+    assert not calls(studied) and not (studied.case / "study" / "folds").exists()
 
 
 def test_a_study_of_another_format_is_not_read(studied):

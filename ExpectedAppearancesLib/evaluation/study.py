@@ -191,7 +191,12 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
         )
     if settings.textures_study and len(styles) < LEFT_OUT:
         problems.add(f"{poses_path}: has frames of {len(styles)} textures; --textures-study tests on {LEFT_OUT}.")
-    if settings.robustness and not settings.protocols and not (case.model_folder / "model.onnx").is_file():
+    if settings.robustness and (case.model_folder / "model.onnx").is_file():
+        from ..registration.predictor import Predictor
+
+        with problems.collect():
+            Predictor(case.model_folder)  # made by an older version it would end the study after all its trainings
+    elif settings.robustness and not settings.protocols:
         problems.add(f"{folder}: has no model to test for robustness; run `train`, or study the protocol strict too.")
     problems.raise_if_any()
     inputs = {
