@@ -110,6 +110,17 @@ def test_network_camera_sees_the_whole_frame_with_square_pixels():
     np.testing.assert_allclose(seen.project([ray])[0], [-0.5, 27.5], atol=0.01)
 
 
+@pytest.mark.parametrize(("width", "height"), [(1280, 1024), (720, 576), (4096, 2160), (480, 720), (256, 256)])
+def test_what_the_network_reads_is_its_camera_halved(width, height):
+    """Frames are resampled at twice its size, then halved; half a row more or less is a millimetre of depth."""
+    frame = Camera(width, height, 3000.0, 2990.0, width * 0.52, height * 0.47)
+    halved, own = network_camera(frame, 256).resized(128, 128), network_camera(frame, 128)
+    np.testing.assert_allclose(halved.matrix, own.matrix, rtol=1e-12)
+    corners = (np.array([(0, 0), (width, height)]) - 0.5 - [frame.cx, frame.cy]) / [frame.fx, frame.fy]
+    seen = own.project(np.column_stack([corners, np.ones(2)]))
+    assert np.ptp(seen, axis=0).max() == pytest.approx(128) and seen.mean(axis=0) == pytest.approx([63.5, 63.5])
+
+
 def dense_output(true: np.ndarray, encoding: PoseEncoding, grid: int = 64) -> np.ndarray:
     """What a perfect network would say of the plane z = CENTRE z, seen by CAMERA."""
     eye = inverse(true)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,9 +63,18 @@ def fit_encoding(poses: np.ndarray, centre_world_mm: np.ndarray, scale_mm: float
 def network_camera(camera: Camera, size_px: int) -> Camera:
     """The square, undistorted camera whose images the network reads: the whole frame, its longer side filling it.
 
-    Pixels of the frame keep their shape; a frame that is not square leaves black bars.
+    Pixels of the frame keep their shape; a frame that is not square leaves black bars. Of twice the size it is
+    `resized` to twice the size: poses are refined on images twice as fine as those that the network reads.
     """
+    # Not rounded to whole rows: 102 and 205 of them are not the same view.
     scale = size_px / max(camera.width, camera.height)
-    resized = camera.without_distortion().resized(round(camera.width * scale), round(camera.height * scale))
-    left, top = (size_px - resized.width) // 2, (size_px - resized.height) // 2
-    return resized.cropped(-left, -top, size_px, size_px)
+    left, top = ((size_px - side * scale) / 2 for side in (camera.width, camera.height))
+    return replace(
+        camera.without_distortion(),
+        width=size_px,
+        height=size_px,
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=(camera.cx + 0.5) * scale - 0.5 + left,
+        cy=(camera.cy + 0.5) * scale - 0.5 + top,
+    )
