@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import vtk
+from cases import dome
 
 from ExpectedAppearancesLib.case.meshes import Mesh, declared_space, read_mesh, write_vtp
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.geometry.pose import look_at
+from ExpectedAppearancesLib.geometry.silhouette import Silhouette
 
 WRITERS = {
     "vtp": vtk.vtkXMLPolyDataWriter,
@@ -196,3 +199,19 @@ def test_a_simplified_surface_has_few_triangles_and_stays_where_it_was():
     middles = coarse.vertices_mm[coarse.triangles].mean(axis=1)
     assert np.abs(np.linalg.norm(middles, axis=1) - 30).max() < 0.3
     assert coarse.simplified(10.0 * coarse.area_mm2 / fine.area_mm2 / 1.1) is coarse
+
+
+def test_triangles_with_vertices_of_their_own_are_one_surface(tmp_path):
+    """An .obj file with a normal for each face: its outline was every edge, and simplified it fell apart."""
+    whole = dome(side_mm=20.0, cells=12)
+    a, b, c = (whole.vertices_mm[whole.triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    lines = ["v {} {} {}".format(*v) for v in whole.vertices_mm] + ["vn {} {} {}".format(*n) for n in normals]
+    lines += ["f " + " ".join(f"{v + 1}//{i + 1}" for v in t) for i, t in enumerate(whole.triangles)]
+    (tmp_path / "dome.obj").write_text("\n".join(lines))
+    mesh = read_mesh(tmp_path / "dome.obj", "mesh")
+    assert len(mesh.vertices_mm) == len(whole.vertices_mm)
+    np.testing.assert_allclose(mesh.vertices_mm[mesh.triangles], whole.vertices_mm[whole.triangles], atol=1e-5)
+    above = look_at(np.array([0, 0, 90.0]), np.zeros(3), np.array([0, 1.0, 0]))
+    assert len(Silhouette(mesh.vertices_mm, mesh.triangles).edges(above)) == 4 * 12
+    assert mesh.simplified(5.0).area_mm2 == pytest.approx(whole.area_mm2, rel=0.05)

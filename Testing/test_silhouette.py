@@ -54,20 +54,6 @@ def test_an_open_surface_shows_its_border_and_no_inner_edge():
     assert {tuple(edge) for edge in silhouette.edges(pose)} == {(0, 1), (1, 2), (2, 3), (0, 3)}
 
 
-def test_triangles_with_vertices_of_their_own_have_the_same_outline():
-    """As an .obj file with a normal for each face, or a mesh split at its creases."""
-    vertices, triangles = sphere(20)
-    split = vertices[triangles].reshape(-1, 3)
-    pose = look_at(CENTRE_MM + np.array([5, 4, 40]), CENTRE_MM, np.array([0.3, 1.0, 0.1]))
-    whole, apart = Silhouette(vertices, triangles), Silhouette(split, np.arange(len(split)).reshape(-1, 3))
-    places = [
-        sorted(sorted(map(tuple, edge)) for edge in mm[outline.edges(pose)])
-        for outline, mm in ((whole, vertices), (apart, split))
-    ]
-    assert places[0] == places[1]
-    assert apart.is_closed and whole.is_closed
-
-
 def test_what_lies_behind_the_camera_is_left_out():
     vertices, triangles = sphere()
     behind = look_at(CENTRE_MM + np.array([0, 0, 40]), CENTRE_MM + np.array([0, 0, 80]), np.array([0.0, 1.0, 0.0]))

@@ -9,13 +9,12 @@ class Silhouette:
     """Edges of a surface between a triangle that faces the camera and one that does not, and its border edges.
 
     The edges are matched to triangles once, so that asking again for another pose is fast.
-    vertices_mm (N, 3), triangles (F, 3) indices of vertices; vertices at the same place count as one, since some files
-    give each triangle its own.
+    vertices_mm (N, 3), triangles (F, 3) indices of vertices.
     """
 
     def __init__(self, vertices_mm: np.ndarray, triangles: np.ndarray):
         self._vertices_mm = np.asarray(vertices_mm, float)
-        triangles = self._triangles = _first_at_each_place(self._vertices_mm)[triangles]
+        self._triangles = np.asarray(triangles)
         a, b, c = (self._vertices_mm[triangles[:, i]] for i in range(3))
         self._middle_mm = self._vertices_mm.mean(axis=0) if len(self._vertices_mm) else np.zeros(3)
         self._face_normals = np.cross(b - a, c - a)
@@ -97,12 +96,3 @@ class Silhouette:
         is_used = np.zeros(len(self._vertices_mm), bool)
         is_used[edges] = True
         return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[edges]
-
-
-def _first_at_each_place(vertices_mm: np.ndarray) -> np.ndarray:
-    """(N,): for each vertex the first of those that lie where it lies."""
-    order = np.lexsort(vertices_mm.T)
-    is_new = np.append(True, (np.diff(vertices_mm[order], axis=0) != 0).any(axis=1))[: len(order)]
-    first = np.empty(len(order), np.int64)
-    first[order] = order[is_new][np.cumsum(is_new) - 1]
-    return first
