@@ -6,11 +6,14 @@ from scipy.spatial import cKDTree
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.demo import frames as demo_frames
 from ExpectedAppearancesLib.demo.frames import write_unseen_frames
+from ExpectedAppearancesLib.demo.phantom import make_phantom
 from ExpectedAppearancesLib.demo.vessel_tree import demo_camera, generate_case_meshes, generate_tree, tree_mesh
+from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 from ExpectedAppearancesLib.registration.poses_file import read_poses
+from ExpectedAppearancesLib.registration.predictor import FORMAT_VERSION, Predictor
 
 
 @pytest.fixture(scope="module")
@@ -144,3 +147,13 @@ def test_frames_show_what_the_label_maps_say(tree, meshes, tmp_path, monkeypatch
             colours.append(np.concatenate([parenchyma, vessel]))
     assert np.abs(colours[0] - colours[1]).max() < 25
     assert np.linalg.norm(colours[1] - colours[2]) > 20
+
+
+def test_a_phantom_kept_since_before_an_update_gets_the_model_of_this_version(tmp_path):
+    made = make_phantom(tmp_path / "case")
+    path = made.case.model_folder / "model.json"
+    files.write_json(path, files.read_json(path, "model") | {"format_version": FORMAT_VERSION - 1})
+    with pytest.raises(InputError, match="older version"):
+        Predictor(made.case.model_folder)
+    make_phantom(tmp_path / "case")
+    Predictor(made.case.model_folder)

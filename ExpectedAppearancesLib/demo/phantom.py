@@ -114,6 +114,9 @@ def make_phantom(folder: Path, seed: int = 0) -> Phantom:
             shutil.rmtree(parts, ignore_errors=True)
         return as_phantom(case)
     case = Case.open(folder)
+    model = files.read_json(folder / "model" / "model.json", "phantom's model")
+    if model.get("format_version") != FORMAT_VERSION:  # kept since before an update, and nobody can train it again
+        return as_phantom(case)
     return Phantom(case, _encoding(case))
 
 
