@@ -15,7 +15,7 @@ from ExpectedAppearancesLib.registration.confidence import calibrate, calibratio
 from ExpectedAppearancesLib.registration.contrast import ContrastAligner
 from ExpectedAppearancesLib.registration.decoding import PlausibleView, cell_pixels, read_dense
 from ExpectedAppearancesLib.registration.pnp import fit_pose
-from ExpectedAppearancesLib.registration.predictor import Predictor, fitted_camera
+from ExpectedAppearancesLib.registration.predictor import FORMAT_VERSION, Predictor, fitted_camera
 from ExpectedAppearancesLib.registration.refinement import VesselAligner
 
 CAMERA = Camera(128, 128, 240.0, 236.0, 66.0, 61.0)
@@ -194,17 +194,19 @@ def test_camera_is_scaled_to_the_frame_and_refused_when_it_cannot_be():
 
 
 def test_missing_and_damaged_models_are_refused(tmp_path):
-    with pytest.raises(InputError, match="trained model not found"):
+    with pytest.raises(InputError, match=r"model\.json: trained model missing; run `train` first"):
         Predictor(tmp_path)
-    (tmp_path / "model.json").write_text(json.dumps({"format_version": 99}))
-    with pytest.raises(InputError, match="newer version"):
-        Predictor(tmp_path)
-    (tmp_path / "model.json").write_text(json.dumps({"format_version": 1, "model_sha256": "0"}))
-    with pytest.raises(InputError, match="missing"):
+    meta = {"format_version": FORMAT_VERSION, "model_sha256": "0"}
+    (tmp_path / "model.json").write_text(json.dumps(meta))
+    with pytest.raises(InputError, match=r"model\.onnx: trained model missing; run `train` first"):
         Predictor(tmp_path)
     (tmp_path / "model.onnx").write_bytes(b"cut")
-    with pytest.raises(InputError, match="damaged"):
+    with pytest.raises(InputError, match=r"damaged \(SHA-256 differs"):
         Predictor(tmp_path)
+    for version, words in ((FORMAT_VERSION + 1, "newer version"), (FORMAT_VERSION - 1, "older version")):
+        (tmp_path / "model.json").write_text(json.dumps(meta | {"format_version": version}))
+        with pytest.raises(InputError, match=words):
+            Predictor(tmp_path)
 
 
 def test_registration_does_not_import_torch():

@@ -46,15 +46,16 @@ class Predictor:
         import onnxruntime
 
         folder = Path(model_folder)
+        path = folder / "model.onnx"
+        for part in (folder / "model.json", path):
+            if not part.is_file():
+                raise InputError(f"{part}: trained model missing; run `train` first.")
         meta = files.read_json(folder / "model.json", "trained model")
         version = meta.get("format_version") if isinstance(meta, dict) else None
         if version != FORMAT_VERSION:
             older = isinstance(version, int) and version < FORMAT_VERSION
             way_out = "an older version; train again" if older else "a newer version; update ExpectedAppearances"
             raise InputError(f"{folder / 'model.json'}: made by {way_out}.")
-        path = folder / "model.onnx"
-        if not path.is_file():
-            raise InputError(f"{path}: trained model missing; run `train` first.")
         if files.sha256(path) != meta.get("model_sha256"):
             raise InputError(
                 f"{path}: damaged (SHA-256 differs from model.json); run `train` again, or restore the file."
