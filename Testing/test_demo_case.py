@@ -1,12 +1,15 @@
+import shutil
+
 import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.demo import frames as demo_frames
 from ExpectedAppearancesLib.demo.frames import write_unseen_frames
-from ExpectedAppearancesLib.demo.phantom import make_phantom
+from ExpectedAppearancesLib.demo.phantom import make_phantom, write_sample_frames
 from ExpectedAppearancesLib.demo.vessel_tree import demo_camera, generate_case_meshes, generate_tree, tree_mesh
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.pose import look_at
@@ -157,3 +160,16 @@ def test_a_phantom_kept_since_before_an_update_gets_the_model_of_this_version(tm
         Predictor(made.case.model_folder)
     make_phantom(tmp_path / "case")
     Predictor(made.case.model_folder)
+
+
+def test_no_command_registers_with_a_model_of_other_vessels(tmp_path, capsys):
+    """Copied into the wrong patient's case, it would accept its own patient's frames, for the wrong mesh."""
+    own, other = make_phantom(tmp_path / "own"), make_phantom(tmp_path / "other", seed=1)
+    frames = write_sample_frames(own, tmp_path / "frames", 2)
+    shutil.rmtree(other.case.model_folder)
+    shutil.copytree(own.case.model_folder, other.case.model_folder)
+    for case, code in ((own.case, 0), (other.case, 2)):
+        folder, out = str(case.folder), tmp_path / "out"
+        assert main(["register", folder, str(frames.parent / "000.png"), "--out", str(out / "p.json")]) == code
+        assert main(["evaluate", folder, "--poses", str(frames), "--out", str(out)]) == code
+    assert capsys.readouterr().err.count("trained on the vessels of another case") == 2

@@ -90,11 +90,11 @@ def test_footage_that_cannot_be_read_is_named(video, tmp_path):
 class SteadyPredictor:
     """A camera that moves by 1 mm a frame; frames 6 and 7 are refused, 12 is far off, found by their red."""
 
-    estimator = "dense"
+    estimator, meta = "dense", {}
     gives_covariance = True
     encoding = fit_encoding(np.eye(4)[None], np.zeros(3), 20.0)
 
-    def __init__(self, _folder=None):
+    def __init__(self, *_):
         pass
 
     def predict(self, image, _camera):

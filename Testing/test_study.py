@@ -63,7 +63,7 @@ class ShiftedPredictor:
 
     known: Path
 
-    def __init__(self, folder):
+    def __init__(self, folder, _threads=2):
         self.folder = Path(folder)
         self.meta = {"preset": "quick"}
         self.frames = read_poses(self.known)[1]

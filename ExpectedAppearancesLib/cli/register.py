@@ -34,7 +34,7 @@ def run(args, progress) -> None:
     from ..geometry.camera import read_camera
     from ..registration.footage import Footage
     from ..registration.poses_file import write_poses
-    from ..registration.predictor import Predictor
+    from ..registration.predictor import open_predictor
     from ..registration.record import frame_record, tracking_record
     from ..registration.tracking import Tracker, TrackerSettings, TrackState
 
@@ -46,7 +46,7 @@ def run(args, progress) -> None:
         camera = read_camera(args.camera) if args.camera else None
     if case:
         with problems.collect():
-            predictor = Predictor(case.model_folder)
+            predictor = open_predictor(case)
     with problems.collect():
         footage = Footage(args.images, args.fps)
     if footage and args.track and not footage.is_video and args.fps is None:

@@ -67,9 +67,9 @@ def evaluate(
             predicted = _pair(true, Path(predicted_path))
     elif predictor is None:
         with problems.collect():
-            from ..registration.predictor import Predictor
+            from ..registration.predictor import open_predictor
 
-            predictor = Predictor(case.model_folder)
+            predictor = open_predictor(case)
     problems.raise_if_any()
 
     if predicted is None:

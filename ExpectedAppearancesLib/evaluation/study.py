@@ -192,10 +192,10 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
     if settings.textures_study and len(styles) < LEFT_OUT:
         problems.add(f"{poses_path}: has frames of {len(styles)} textures; --textures-study tests on {LEFT_OUT}.")
     if settings.robustness and (case.model_folder / "model.onnx").is_file():
-        from ..registration.predictor import Predictor
+        from ..registration.predictor import open_predictor
 
         with problems.collect():
-            Predictor(case.model_folder)  # made by an older version it would end the study after all its trainings
+            open_predictor(case)  # made by an older version it would end the study after all its trainings
     elif settings.robustness and not settings.protocols:
         problems.add(f"{folder}: has no model to test for robustness; run `train`, or study the protocol strict too.")
     problems.raise_if_any()
@@ -372,10 +372,10 @@ def _robustness(one: StudyCase, settings: StudySettings, progress: ProgressFunct
 
 def _predictor_of(one: StudyCase, settings: StudySettings):
     """(style -> predictor, which model that is): the case's own model, else those of the first preset's folds."""
-    from ..registration.predictor import Predictor
+    from ..registration.predictor import Predictor, open_predictor
 
     if (one.case.model_folder / "model.onnx").is_file():
-        own = Predictor(one.case.model_folder)
+        own = open_predictor(one.case)
         return (lambda _style: own), f"the case's own model ({own.meta['preset']})"
     preset, protocol = settings.presets[0], settings.protocols[0]
     folders = {style: _job(one, settings, preset, protocol, style, (style,)).folder for style in one.styles}

@@ -50,15 +50,9 @@ def open_model(case: Case) -> OpenedModel:
             f"onnxruntime, which runs the model, cannot be loaded ({error}); install it: the panel offers to, or give "
             "slicer.util.pip_install('onnxruntime') in the Python console."
         ) from error
-    from ..registration.predictor import Predictor
+    from ..registration.predictor import open_predictor
 
-    estimator = Predictor(case.model_folder, THREADS)
-    trained_on = estimator.meta.get("vessels_sha256")
-    if trained_on and trained_on != case_key(case):
-        raise InputError(
-            f"{case.model_folder}: this model was trained on the vessels of another case; train this case, or open "
-            "the case that the model belongs to."
-        )
+    estimator = open_predictor(case, THREADS)
     camera = estimator.case_camera
     # The first pass allocates and compiles: better now than with the first frame.
     estimator.predict(np.zeros((camera.height, camera.width, 3), np.uint8))

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from .. import files
+from ..case.case import Case
 from ..case.meshes import read_mesh
 from ..errors import InputError
 from ..geometry.camera import Camera
@@ -142,6 +143,18 @@ class Predictor:
                 key: cv2.initUndistortRectifyMap(camera.matrix, distortion, None, wanted.matrix, size, cv2.CV_32FC1)
             }
         return cv2.remap(image_rgb, *self._maps[key], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def open_predictor(case: Case, threads: int = 2) -> Predictor:
+    """The case's own. Raises InputError where its model is missing or damaged, or was trained on other vessels."""
+    predictor = Predictor(case.model_folder, threads)
+    trained_on = predictor.meta.get("vessels_sha256")
+    if trained_on and trained_on != case.manifest["inputs"]["vessels"]["sha256"]:
+        raise InputError(
+            f"{case.model_folder}: this model was trained on the vessels of another case; train this case, or open "
+            "the case that the model belongs to."
+        )
+    return predictor
 
 
 def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
