@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import os
@@ -306,6 +307,26 @@ def test_nearest_other_pose_against_plain_distances():
     points = np.random.default_rng(0).normal(size=(40, 3))
     assert sorted(study.nearest_other_pose_add_mm(points, [*poses, poses[0]])) == pytest.approx([3, 3, 7])
     assert len(study.nearest_other_pose_add_mm(points, poses[:1])) == 0
+
+
+def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
+    """The paper's preset makes every pose with every texture: frames drawn of one are at poses of the others."""
+    case = Case.open(studied.case)
+    index = store.read_index(case, "surface")
+    for style in "abc":
+        files.write_png(store.folder_of(case, "image") / f"{style}.png", np.full((8, 8, 3), 90, np.uint8))
+    write_index = functools.partial(store.write_index, case, "image", camera(), {}, done=True)
+    write_index(index["items"])
+    monkeypatch.setattr(study, "drawn_frames", lambda *_: studied.poses)
+    unasked = [(studied.case, None)]
+    for settings in (QUICK, replace(QUICK, protocols=(), textures_study=True)):
+        with pytest.raises(InputError, match="loto alone"):
+            study.run_study(unasked, studied.out, replace(settings, method="image"))
+    assert not calls(studied)
+    study._check(unasked, studied.out, replace(QUICK, protocols=("loto",), method="image"), lambda *_: None)
+    poses = [pose_from_rotation(np.eye(3), (i, 0, 80)).tolist() for i in range(3)]
+    write_index([item | {"camera_from_world": pose} for item, pose in zip(index["items"], poses)])
+    study._check(unasked, studied.out, replace(QUICK, method="image"), lambda *_: None)
 
 
 def test_all_problems_at_once_and_nothing_trained(studied, tmp_path, capsys):

@@ -26,7 +26,7 @@ from .evaluate import Evaluation, check_out, compare, known_frames, overlay_imag
 from .metrics import add_auc, add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
-from .study_frames import FRAMES_PER_TEXTURE, drawn_frames
+from .study_frames import FRAMES_PER_TEXTURE, check_unseen_poses, drawn_frames
 from .verdict import STUDY_FORMAT
 
 FORMAT_VERSION = 1
@@ -162,7 +162,10 @@ def _drawn(folder: Path, settings: StudySettings, progress: ProgressFunction) ->
     def report(_fraction: float, text: str) -> None:
         progress(0.0, text)
 
-    return drawn_frames(Case.open(folder), settings.method, settings.frames, settings.seed, report)
+    case = Case.open(folder)
+    if "strict" in settings.protocols or settings.textures_study:
+        check_unseen_poses(case, settings.method)
+    return drawn_frames(case, settings.method, settings.frames, settings.seed, report)
 
 
 def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:

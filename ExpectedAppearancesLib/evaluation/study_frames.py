@@ -67,6 +67,19 @@ def drawn_frames(
     return path
 
 
+def check_unseen_poses(case: Case, method: str | None) -> None:
+    """Raise InputError where frames that are drawn of one texture would be at poses that models are trained on, which
+    the others' appearances have: of method `image` where each pose is made with every texture, as in the paper."""
+    method, appearances = read_appearances(case, method)
+    poses = {appearance.camera_from_world.tobytes() for appearance in appearances}
+    if method == "image" and len(poses) < len(appearances):
+        raise InputError(
+            f"{case.folder}: its appearances show the same poses in several textures, so no frame at a pose that is "
+            "unseen can be drawn of them; study the protocol loto alone, give frames with --poses, or synthesise with "
+            "the method surface."
+        )
+
+
 def _known(record: Path) -> dict | None:
     try:
         return files.read_json(record, "record of the test frames")
