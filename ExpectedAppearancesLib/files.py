@@ -60,7 +60,7 @@ def read_json(path: Path, what: str):
     if not path.is_file():
         raise InputError(f"{path}: {what} not found; check the path.")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # Windows' editors put a mark before the text
     except (ValueError, OSError) as error:
         raise InputError(f"{path}: {what} cannot be read as JSON ({error}); make the file again.") from error
 

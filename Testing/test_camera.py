@@ -128,3 +128,11 @@ def test_all_problems_of_a_camera_are_reported_at_once(tmp_path):
 def test_intrinsics_that_do_not_fit_the_image(change, words):
     with pytest.raises(InputError, match=words):
         Camera.from_dict(DISTORTED.to_dict() | change)
+
+
+def test_a_file_that_was_edited_on_windows_is_read(tmp_path):
+    camera = Camera(640, 480, 900.0, 910.0, 320.0, 240.0)
+    write_camera(tmp_path / "camera.json", camera)
+    text = (tmp_path / "camera.json").read_text(encoding="utf-8")
+    (tmp_path / "camera.json").write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
+    assert read_camera(tmp_path / "camera.json").matrix.tolist() == camera.matrix.tolist()
