@@ -101,6 +101,18 @@ def test_cancelling_stops_the_workers_too(cluster, tmp_path):
     assert len(store.read_appearances(case, "surface")[1]) == 2 * len(STYLES)
 
 
+def test_a_cluster_whose_workers_are_all_gone_is_told(tmp_path):
+    """It is waited for a worker, as long as it takes; who watches must know that."""
+
+    def told(_fraction, message):
+        if "no worker" in message:
+            raise CancelledError(message)
+
+    nobody = distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=None, host="127.0.0.1")
+    with nobody, pytest.raises(CancelledError, match="start `dask worker`"):
+        synthesize(make_case(tmp_path), executor_of(nobody), told)
+
+
 @pytest.fixture
 def one_thread():
     """As the workers have: in fp32 roundings may depend on it."""

@@ -69,7 +69,8 @@ def _run_on_dask(shards: list[Shard], recipe: Recipe, executor: str, on_progress
                     held.append(shard)  # by another process, or lost to one
                 else:
                     done += len(shard.items)
-            on_progress(done, f"{len(running)} shards on the cluster")
+            at_work = f"{len(running)} shards on the cluster"
+            on_progress(done, at_work if client.nthreads() else "the scheduler has no worker: start `dask worker`")
             if held and not running:
                 time.sleep(POLL_S)
             waiting += held
