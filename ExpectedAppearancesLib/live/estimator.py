@@ -12,7 +12,7 @@ import numpy as np
 from ..case.case import Case
 from ..errors import InputError
 from ..geometry.camera import Camera
-from ..registration.footage import FRAME_MARK
+from ..registration.footage import is_there, video_and_number
 from ..registration.poses_file import read_poses
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path,
         )
         for frame in frames
     }
-    there = {frame.image for frame in frames if (_video_of(frame.image) or frame.image).is_file()}
+    there = {frame.image for frame in frames if is_there(frame.image)}
     missing = [frame.image for frame in frames if frame.image not in there]
     if len(missing) == len(frames):
         raise InputError(
@@ -88,15 +88,11 @@ def given_poses(poses_path: Path) -> tuple[Camera | None, list[Path], dict[Path,
 
 def poses_of_video(given: dict[Path, Prediction]) -> tuple[Path, dict[int, Prediction]] | None:
     """The video whose frames all paths name, and the prediction of each number; None where they name anything else."""
-    videos = {_video_of(image) for image in given}
+    named = {image: video_and_number(image) for image in given}
+    videos = {found and found[0] for found in named.values()}
     if len(videos) != 1 or None in videos:
         return None
-    return videos.pop(), {int(image.name.rpartition(FRAME_MARK)[2]): found for image, found in given.items()}
-
-
-def _video_of(image: Path) -> Path | None:
-    name, mark, number = image.name.rpartition(FRAME_MARK)
-    return image.with_name(name) if mark and number.isdecimal() and not image.is_file() else None
+    return videos.pop(), {named[image][1]: prediction for image, prediction in given.items()}
 
 
 def _number(value, otherwise: float) -> float:

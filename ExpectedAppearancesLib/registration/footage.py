@@ -97,21 +97,29 @@ class Footage:
             raise InputError(f"{path}: no frame of this video can be read; save it again as MP4 (H.264) or AVI.")
 
 
+def video_and_number(image: Path) -> tuple[Path, int] | None:
+    """Of a frame that is called VIDEO#frame=N; None where it is a file of its own."""
+    name, mark, number = image.name.rpartition(FRAME_MARK)
+    return (image.with_name(name), int(number)) if mark and number.isdecimal() and not image.is_file() else None
+
+
 def is_there(image: Path) -> bool:
     """Whether the file of a frame is there; for VIDEO#frame=N that of the video."""
-    return image.is_file() or (FRAME_MARK in image.name and Path(str(image).rpartition(FRAME_MARK)[0]).is_file())
+    found = video_and_number(image)
+    return (found[0] if found else image).is_file()
 
 
 def read_video_frame(path: Path) -> np.ndarray:
     """The frame that a path VIDEO#frame=N names, uint8 RGB (H, W, 3). Raises InputError."""
     import cv2
 
-    video, _, number = str(path).rpartition(FRAME_MARK)
-    if not number.isdecimal() or not Path(video).is_file():
+    named = video_and_number(path)
+    if named is None or not named[0].is_file():
         raise InputError(f"{path}: video not found; check the path.")
-    capture = _open(Path(video))
+    video, number = named
+    capture = _open(video)
     try:
-        capture.set(cv2.CAP_PROP_POS_FRAMES, int(number))
+        capture.set(cv2.CAP_PROP_POS_FRAMES, number)
         found, image = capture.read()
     finally:
         capture.release()
