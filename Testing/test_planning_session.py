@@ -293,7 +293,8 @@ def test_a_refresh_does_only_what_has_changed(scene, planned, tmp_path, counted)
     assert tick() == {"PoseSampler": 1}
     p.vesselsNode.SetAndObserveTransformNodeID(None)
     moved = tick()
-    assert moved == {"world_mesh": 1, "same_mesh": 1, "find_craniotomy": 1, "PoseSampler": 1}
+    # They are now so far off that another part of the cortex is near them: its axis is found, then the centre.
+    assert moved == {"world_mesh": 1, "same_mesh": 1, "find_craniotomy": 2, "PoseSampler": 1}
     store.write_index(case, "surface", camera, settings, [item] * 501, done=True)
     assert tick() == {"read_json": 1, "sha256": 1, "overview_changed": 1, "newest_image": 1}
 

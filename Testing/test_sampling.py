@@ -8,7 +8,14 @@ from ExpectedAppearancesLib.case.meshes import Mesh
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.pose import inverse, is_rigid
 from ExpectedAppearancesLib.poses import sampling
-from ExpectedAppearancesLib.poses.craniotomy import Craniotomy, disc_under_vessels, find_craniotomy, is_closed
+from ExpectedAppearancesLib.poses.craniotomy import (
+    Craniotomy,
+    disc_under_vessels,
+    find_craniotomy,
+    has_own_axis,
+    near_vessels,
+    parenchyma_around,
+)
 from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
 
 TURN = Rotation.from_euler("xyz", [40, -65, 20], degrees=True).as_matrix()
@@ -43,7 +50,39 @@ def test_outward_axis_on_a_closed_brain_is_where_its_vessels_lie(side):
     on_top = Mesh((vessels().vertices_mm + np.array([0, 0, 70])) * [side, 1, side], vessels().triangles)
     found = find_craniotomy(turned(on_top), turned(brain))
     assert np.degrees(np.arccos(found.outward_axis @ (TURN @ [0, 0, side]))) < 12
-    assert is_closed(brain) and not is_closed(dome())
+    assert has_own_axis(dome(), vessels()) and not has_own_axis(brain, on_top)
+
+
+def test_outward_axis_on_half_a_brain_is_that_of_the_place_and_not_of_the_half():
+    whole = ball()
+    right = Mesh(whole.vertices_mm, whole.triangles[(whole.vertices_mm[whole.triangles, 0] > -1).all(axis=1)])
+    place = 70 * np.array([0.8 * np.sqrt(0.5), 0, np.sqrt(0.5)])
+    outward = place / [0.8**2, 1, 1] / np.linalg.norm(place / [0.8**2, 1, 1])
+    turn = np.stack([np.cross([0, 1, 0], outward), [0, 1, 0], outward], axis=1)
+    on_the_side = Mesh(vessels().vertices_mm @ turn.T + place, vessels().triangles)
+    found = find_craniotomy(turned(on_the_side), turned(right))
+    assert np.degrees(np.arccos(found.outward_axis @ (TURN @ outward))) < 8  # of the whole half it is 40 degrees off
+
+
+def test_of_a_whole_brain_the_part_around_the_vessels_is_seen():
+    brain, on_top = ball(cells=120), Mesh(vessels().vertices_mm + np.array([0, 0, 70]), vessels().triangles)
+    axis, reach_mm = np.array([0, 0, 1.0]), 1.75 * vessels().radius_mm
+    part = parenchyma_around(on_top, brain, axis)
+    distances_mm = np.linalg.norm(part.vertices_mm - on_top.centroid_mm, axis=1)
+    assert distances_mm.max() < reach_mm + 6
+    assert part.vertices_mm[:, 2].min() > 0, "the other side of the brain is in it"
+    corners = {tuple(corner) for corner in brain.vertices_mm.round(6).tolist()}
+    assert {tuple(corner) for corner in part.vertices_mm.round(6).tolist()} <= corners
+    near = np.linalg.norm(brain.vertices_mm - on_top.centroid_mm, axis=1) < reach_mm
+    assert (distances_mm < reach_mm).sum() == near.sum() > 100  # and nothing near is left out
+    patch = dome()
+    assert parenchyma_around(vessels(), patch, axis) is patch
+
+
+def test_a_coarse_cortex_has_no_hole_where_the_vessels_are():
+    far = np.array([[-900, -900, 0], [900, -900, 0], [0, 900, 0], [5000, 0, 0], [6000, 0, 0], [5000, 900, 0]], float)
+    part = near_vessels(Mesh(far, np.array([[0, 1, 2], [3, 4, 5]])), vessels())
+    np.testing.assert_array_equal(part.vertices_mm[part.triangles], far[None, :3])
 
 
 def test_outward_axis_is_fitted_to_the_vessels_where_there_is_no_cortex():

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..case.meshes import Mesh
 from ..geometry.camera import Camera
-from ..poses.craniotomy import disc_under_vessels
+from ..poses.craniotomy import parenchyma_around
 from .renderer import MaskRenderer
 
 
@@ -51,7 +51,7 @@ def answering() -> Callable[[dict], str]:
                 kept[1].close()
             cortex = _mesh(folder, "cortex") if (folder / "cortex.vertices.npy").is_file() else None
             vessels = _mesh(folder, "vessels")
-            parenchyma = cortex or disc_under_vessels(vessels, np.array(asked["outward_axis"]))
+            parenchyma = parenchyma_around(vessels, cortex, np.array(asked["outward_axis"]))
             kept[:] = key, MaskRenderer(vessels, parenchyma, Camera.from_dict(asked["camera"]))
         path = folder / f"labels.{next(turns)}.npy"
         np.save(path, kept[1].render(np.array(asked["camera_from_world"])))

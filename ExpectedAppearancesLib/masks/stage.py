@@ -11,7 +11,7 @@ from .. import files
 from ..case.case import Case
 from ..case.meshes import Mesh
 from ..errors import InputError
-from ..poses.craniotomy import Craniotomy, disc_under_vessels, find_craniotomy
+from ..poses.craniotomy import Craniotomy, find_craniotomy, parenchyma_around
 from ..poses.sampling import PoseRanges, PoseSampler
 from .renderer import MaskRenderer
 
@@ -27,7 +27,7 @@ def craniotomy_of(case: Case) -> Craniotomy:
 
 
 def parenchyma_of(case: Case, craniotomy: Craniotomy) -> Mesh:
-    return case.cortex or disc_under_vessels(case.vessels, craniotomy.outward_axis)
+    return parenchyma_around(case.vessels, case.cortex, craniotomy.outward_axis)
 
 
 def pose_ranges_of(case: Case) -> PoseRanges:

@@ -16,7 +16,7 @@ from ..case.steps import Chosen, Recorded, Step, craniotomy_moved, plan_steps
 from ..errors import InputError, Problems
 from ..evaluation.verdict import Limits
 from ..geometry.camera import Camera, read_camera, write_camera
-from ..poses.craniotomy import Craniotomy, find_craniotomy, is_closed
+from ..poses.craniotomy import Craniotomy, find_craniotomy, has_own_axis
 from ..poses.sampling import PoseRanges, PoseSampler
 from ..textures.library import list_textures, names_taken_twice, shipped_textures_folder
 from . import mri, planning
@@ -112,8 +112,9 @@ class PlanningSession:
 
     def _fitted_axis(self, vessels: Mesh, cortex: Mesh | None, space: str) -> np.ndarray:
         """Takes a tenth of a second on a large model, and stays while a point is dragged, or the vessels are moved over
-        an open cortex."""
-        own = cortex is not None and not self._once("closed", _Same(cortex), lambda: is_closed(cortex))
+        a cortex that has an axis of its own."""
+        version = (_Same(cortex), _Same(vessels))
+        own = cortex is not None and self._once("own axis", version, lambda: has_own_axis(cortex, vessels))
         version = (_Same(cortex), None if own else _Same(vessels), space)
         return self._once("axis", version, lambda: find_craniotomy(vessels, cortex, space).outward_axis)
 

@@ -9,6 +9,7 @@ import numpy as np
 from ..case.meshes import Mesh
 from ..errors import InputError
 
+REACH = 1.75  # of the vessels' radius: how far around them a cortex is seen and synthesised
 CLOSED_SHARE = 0.05  # a surface that faces one way by less is closed, but for small holes
 
 
@@ -36,7 +37,7 @@ def find_craniotomy(
     if normal is not None:
         axis = np.asarray(normal, float)
     elif cortex is not None:
-        axis = _axis_of_cortex(cortex, vessels)
+        axis = _axis_of_cortex(near_vessels(cortex, vessels), vessels)
     else:
         axis = _axis_of_vessels(vessels)
     length = np.linalg.norm(axis)
@@ -55,6 +56,28 @@ def upright(axis: np.ndarray, space: str) -> np.ndarray:
     return across / np.linalg.norm(across)
 
 
+def parenchyma_around(vessels: Mesh, cortex: Mesh | None, outward_axis: np.ndarray) -> Mesh:
+    """What is seen beside the vessels: the cortex near them, or a disc where there is no cortex model."""
+    return disc_under_vessels(vessels, outward_axis) if cortex is None else near_vessels(cortex, vessels)
+
+
+def near_vessels(cortex: Mesh, vessels: Mesh) -> Mesh:
+    """The part of a cortex, which may be that of a whole brain, within REACH of the vessels; all of it where it is no
+    larger, or nowhere near."""
+    reach_mm = REACH * vessels.radius_mm
+    if (np.linalg.norm(cortex.vertices_mm - vessels.centroid_mm, axis=1) <= reach_mm).all():
+        return cortex
+    corners_mm = cortex.vertices_mm[cortex.triangles] - vessels.centroid_mm
+    middles_mm = corners_mm.mean(axis=1)
+    # By the sphere around each: a large triangle may pass the vessels with all its corners far away.
+    sizes_mm = np.linalg.norm(corners_mm - middles_mm[:, None], axis=2).max(axis=1)
+    kept = cortex.triangles[np.linalg.norm(middles_mm, axis=1) - sizes_mm <= reach_mm]
+    if not len(kept):
+        return cortex
+    used, triangles = np.unique(kept, return_inverse=True)
+    return Mesh(cortex.vertices_mm[used], triangles.reshape(-1, 3))
+
+
 def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray, segments: int = 96) -> Mesh:
     """Parenchyma for a case without a cortex model: a disc just below all vessels, 15 % wider than they are."""
     heights = (vessels.vertices_mm - vessels.centroid_mm) @ outward_axis
@@ -70,9 +93,10 @@ def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray, segments: int = 
     return Mesh(np.vstack([centre, rim]), triangles)
 
 
-def is_closed(cortex: Mesh) -> bool:
-    """Whether the surface faces all ways alike, as that of a whole brain or of a segment: it has no axis of its own."""
-    return _one_way(cortex)[1] < CLOSED_SHARE
+def has_own_axis(cortex: Mesh, vessels: Mesh) -> bool:
+    """Whether the axis of this cortex is the same wherever the vessels lie on it: neither is it larger than what is
+    seen around them, nor does it face all ways."""
+    return near_vessels(cortex, vessels) is cortex and _one_way(cortex)[1] >= CLOSED_SHARE
 
 
 def _axis_of_cortex(cortex: Mesh, vessels: Mesh) -> np.ndarray:
