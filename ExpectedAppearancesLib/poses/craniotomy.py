@@ -134,5 +134,5 @@ def _towards_bulge(axis: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
     offset = points_mm - points_mm.mean(axis=0)
     height = offset @ axis
     distance_2 = (offset**2).sum(axis=1) - height**2
-    slope = np.polyfit(distance_2, height, 1)[0]
-    return -axis if slope > 0 else axis
+    rises_outwards = (distance_2 - distance_2.mean()) @ height > 0
+    return -axis if rises_outwards else axis
