@@ -124,17 +124,15 @@ class Predictor:
 
     def _resample(self, image_rgb: np.ndarray, camera: Camera, wanted: Camera) -> np.ndarray:
         """The frame as the camera `wanted` would have taken it: undistorted, same centre of projection."""
-        shrink = wanted.fx / camera.fx
-        if shrink < 0.75:
-            # Averaged down first, since remap samples single pixels and would alias. By halves at first, as far as they
-            # go: averaging over fractions of pixels costs ten times as much.
-            size = (max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
-            width, height = camera.width, camera.height
-            while width >= 2 * size[0] and height >= 2 * size[1] and width % 2 == height % 2 == 0:
-                width, height = width // 2, height // 2
-                image_rgb = cv2.resize(image_rgb, (width, height), interpolation=cv2.INTER_AREA)
-            image_rgb = cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA)
-            camera = camera.resized(*size)
+        # Averaged down first, since remap mixes two by two pixels and would alias. By halves as far as they go:
+        # averaging over fractions of pixels costs ten times as much, and above one half it gains nothing.
+        while wanted.fx <= 0.5 * camera.fx and camera.width % 2 == camera.height % 2 == 0:
+            camera = camera.resized(camera.width // 2, camera.height // 2)
+            image_rgb = cv2.resize(image_rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        if wanted.fx < 0.5 * camera.fx:
+            shrink = wanted.fx / camera.fx
+            camera = camera.resized(*(max(1, round(side * shrink)) for side in (camera.width, camera.height)))
+            image_rgb = cv2.resize(image_rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         key = (camera, wanted)
         if key not in self._maps:
             distortion = np.array(camera.distortion) if camera.is_distorted else None

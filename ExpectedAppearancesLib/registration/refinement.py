@@ -51,7 +51,9 @@ class VesselAligner:
         field, in_view = _signed_distance(vessel_logit, surface_logit, scale)
         finer = field.shape[1] / self._camera.width
         focal = np.array([self._camera.fx, self._camera.fy])
-        principal = np.array([self._camera.cx, self._camera.cy])
+        # The camera of the field, whose pixels are finer.
+        field_focal = finer * focal[:, None]
+        field_principal = finer * (np.array([[self._camera.cx], [self._camera.cy]]) + 0.5) - 0.5
         edges = self._silhouette.edges(fit.camera_from_world, facing_borders_only=True)
         edges = edges[:: len(edges) // POINTS + 1]
         relative = np.ascontiguousarray((self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm).T)
@@ -59,8 +61,8 @@ class VesselAligner:
         for _ in range(ITERATIONS):
             turned = descent.rotation @ relative
             seen = turned + descent.position[:, None]
-            pixels = seen[:2] / np.maximum(seen[2], 1.0) * focal[:, None] + principal[:, None]
-            where = np.ascontiguousarray(((pixels + 0.5) * finer - 0.5).T, np.float32)[None]
+            pixels = seen[:2] / np.maximum(seen[2], 1.0) * field_focal + field_principal
+            where = np.ascontiguousarray(pixels.T, np.float32)[None]
             distance, along, down = cv2.split(
                 cv2.remap(field, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e3, 0, 0))
             )
