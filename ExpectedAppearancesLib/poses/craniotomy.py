@@ -64,14 +64,13 @@ def parenchyma_around(vessels: Mesh, cortex: Mesh | None, outward_axis: np.ndarr
 def near_vessels(cortex: Mesh, vessels: Mesh) -> Mesh:
     """The part of a cortex, which may be that of a whole brain, within REACH of the vessels; all of it where it is no
     larger, or nowhere near."""
-    reach_mm = REACH * vessels.radius_mm
-    if (np.linalg.norm(cortex.vertices_mm - vessels.centroid_mm, axis=1) <= reach_mm).all():
+    if _is_within_reach(cortex, vessels):
         return cortex
     corners_mm = cortex.vertices_mm[cortex.triangles] - vessels.centroid_mm
     middles_mm = corners_mm.mean(axis=1)
     # By the sphere around each: a large triangle may pass the vessels with all its corners far away.
     sizes_mm = np.linalg.norm(corners_mm - middles_mm[:, None], axis=2).max(axis=1)
-    kept = cortex.triangles[np.linalg.norm(middles_mm, axis=1) - sizes_mm <= reach_mm]
+    kept = cortex.triangles[np.linalg.norm(middles_mm, axis=1) - sizes_mm <= REACH * vessels.radius_mm]
     if not len(kept):
         return cortex
     used, triangles = np.unique(kept, return_inverse=True)
@@ -96,7 +95,12 @@ def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray, segments: int = 
 def has_own_axis(cortex: Mesh, vessels: Mesh) -> bool:
     """Whether the axis of this cortex is the same wherever the vessels lie on it: neither is it larger than what is
     seen around them, nor does it face all ways."""
-    return near_vessels(cortex, vessels) is cortex and _one_way(cortex)[1] >= CLOSED_SHARE
+    return _is_within_reach(cortex, vessels) and _one_way(cortex)[1] >= CLOSED_SHARE
+
+
+def _is_within_reach(cortex: Mesh, vessels: Mesh) -> bool:
+    distances_mm = np.linalg.norm(cortex.vertices_mm - vessels.centroid_mm, axis=1)
+    return bool((distances_mm <= REACH * vessels.radius_mm).all())
 
 
 def _axis_of_cortex(cortex: Mesh, vessels: Mesh) -> np.ndarray:
