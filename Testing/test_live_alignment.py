@@ -22,13 +22,23 @@ def application():
     return new_application()
 
 
+def holding_a_frame(scene, phantom, model) -> LiveController:
+    controller = LiveController(scene)
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    return controller
+
+
+def pick_in_frame(in_frame, seen_mm: np.ndarray, plane_mm: float) -> None:
+    """A landmark on the image plane where the frame shows a point (3,), camera mm."""
+    in_frame.SetNthControlPointPosition(in_frame.AddControlPoint(0, 0, 0), *(seen_mm * plane_mm / seen_mm[2]))
+
+
 def test_alignment_by_handles_sliders_and_landmarks_gives_the_true_pose(application, phantom, model, frames):
     scene, _logic = application
     true = frames[0][2]
     node_with(scene, frames[1][2])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
-    wait_for(controller, lambda s: s.new)
+    controller = holding_a_frame(scene, phantom, model)
     before = scene.GetNumberOfNodes()
     alignment = controller.begin_alignment()
     start = alignment.camera_from_world
@@ -60,8 +70,7 @@ def test_alignment_by_handles_sliders_and_landmarks_gives_the_true_pose(applicat
     in_camera = vertices @ true[:3, :3].T + true[:3, 3]
     for point, seen in zip(vertices, in_camera):
         on_mesh.AddControlPoint(*(point * [-1, -1, 1]))
-        index = in_frame.AddControlPoint(0, 0, 0)
-        in_frame.SetNthControlPointPosition(index, *(seen * controller.live.plane_mm / seen[2]))
+        pick_in_frame(in_frame, seen, controller.live.plane_mm)
     assert controller.align_to_landmarks(in_frame, on_mesh) < 0.01
     assert add_of(phantom, true, alignment.camera_from_world) < 0.01
     controller.finish_alignment(keep=True)
@@ -83,9 +92,7 @@ def test_alignment_holds_when_the_user_transforms_the_models(application, phanto
     scene, _logic = application
     true = frames[0][2]
     node_with(scene, frames[1][2])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
-    wait_for(controller, lambda s: s.new)
+    controller = holding_a_frame(scene, phantom, model)
     patient = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Patient moved")
     moved = vtk.vtkTransform()
     moved.Translate(40, -25, 60)
@@ -108,8 +115,7 @@ def test_alignment_holds_when_the_user_transforms_the_models(application, phanto
     for point, seen in zip(vertices, in_camera):
         clicked = to_world.MultiplyPoint((*(point * [-1, -1, 1]), 1.0))[:3]
         on_mesh.SetNthControlPointPositionWorld(on_mesh.AddControlPoint(0, 0, 0), *clicked)
-        index = in_frame.AddControlPoint(0, 0, 0)
-        in_frame.SetNthControlPointPosition(index, *(seen * controller.live.plane_mm / seen[2]))
+        pick_in_frame(in_frame, seen, controller.live.plane_mm)
     assert controller.align_to_landmarks(in_frame, on_mesh) < 0.01
     controller.finish_alignment(keep=True)
     assert add_of(phantom, true, controller.truth) < 0.01
@@ -122,9 +128,7 @@ def test_alignment_holds_when_the_user_transforms_the_models(application, phanto
 def test_true_poses_are_collected_for_evaluation(application, phantom, model, frames, tmp_path):
     scene, _logic = application
     stream = node_with(scene, frames[1][2])
-    controller = LiveController(scene)
-    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
-    wait_for(controller, lambda s: s.new)
+    controller = holding_a_frame(scene, phantom, model)
     with pytest.raises(InputError, match="align the vessels"):
         controller.save_truth(tmp_path)
     for i in (2, 3):
