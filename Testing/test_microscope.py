@@ -104,6 +104,15 @@ def test_occluders_are_local(changes):
     assert 0 < np.mean(changed) < 0.35
 
 
+def test_instruments_are_of_all_widths_and_more_often_thin():
+    image = np.full((128, 128, 3), (180, 90, 90), np.uint8)
+    shares = []
+    for seed in range(60):
+        changed = np.abs(looked(seed, image, instrument_probability=1.0).astype(int) - image).max(axis=2) > 8
+        shares.append(changed.mean())
+    assert np.median(shares) < 0.1 < np.quantile(shares, 0.8) and max(shares) > 0.15
+
+
 def test_circular_field_is_black_outside():
     image = np.full((100, 100, 3), 200, np.uint8)
     result = looked(image=image, circular_field=(0.4, 0.4), circular_field_probability=1)

@@ -56,6 +56,7 @@ def test_places_in_the_overview_are_projections_of_the_points(scene):
 def test_classes_keep_their_place_and_colour_wherever_the_parenchyma_comes_from(scene, monkeypatch, registered):
     case, appearance, view, (labels, depth_mm, points) = scene
     monkeypatch.setattr(projection, "REGISTERED", registered)
+    monkeypatch.setattr(projection, "FAINT", 0.0)
     monkeypatch.setattr(projection, "DEPTH_OF_FIELD", 0.0)
     monkeypatch.setattr(SurfacePainter, "_lit", lambda _self, image, *_: image)
     painter = SurfacePainter(case.vessels, case.cortex, [appearance])
@@ -65,6 +66,23 @@ def test_classes_keep_their_place_and_colour_wherever_the_parenchyma_comes_from(
     blue = image[..., 2] > image[..., 0]
     assert (blue & (labels == VESSELS)).sum() > 0.8 * (labels == VESSELS).sum()
     assert not (blue & inside).any()
+
+
+def test_faint_vessels_shine_through_the_parenchyma_alike_all_over_and_are_never_gone(scene, monkeypatch):
+    case, appearance, view, (labels, depth_mm, points) = scene
+    for name, value in (("REGISTERED", 0.0), ("FAINT", 1.0), ("DEPTH_OF_FIELD", 0.0)):
+        monkeypatch.setattr(projection, name, value)
+    monkeypatch.setattr(SurfacePainter, "_lit", lambda _self, image, *_: image)
+    painter = SurfacePainter(case.vessels, case.cortex, [appearance])
+    inside, vessels = (cv2.erode((labels == label).astype(np.uint8), np.ones((3, 3))) > 0 for label in (1, 2))
+    own = []
+    for seed in range(12):
+        image = painter.paint(labels, depth_mm, painter.overview_px(points), view, np.random.default_rng(seed))
+        assert np.abs(image[inside] - np.array(RED)).mean() < 12
+        share = (image[vessels].astype(float) - RED) @ np.subtract(BLUE, RED) / np.sum(np.subtract(BLUE, RED) ** 2)
+        assert np.median(np.abs(share - np.median(share))) < 0.05
+        own.append(np.median(share))
+    assert min(own) > 0.95 * projection.FAINTEST and np.ptp(own) > 0.2
 
 
 def test_light_falls_off_with_the_angle_of_the_surface(scene, monkeypatch):

@@ -18,6 +18,8 @@ from .store import Appearance
 
 REGISTERED = 0.4  # share of views with the parenchyma where it was synthesised; in the others it lies anywhere
 MIX_STYLES = 0.35  # share of views whose vessels come from another texture than the parenchyma
+FAINT = 0.5  # share of those others whose vessels shine through the parenchyma more or less, as deep ones do
+FAINTEST = 0.4  # weight of the vessels' own colour in them, at least
 DEPTH_OF_FIELD = 0.25  # share of views that are out of focus away from one depth
 GLOSS = 0.5  # share of views with a wet gleam
 
@@ -61,6 +63,9 @@ class SurfacePainter:
         else:
             # No two views share their parenchyma's pattern: where the vessels run is all that tells the pose.
             image = _look_up(self._plate(overview), _elsewhere(where_px, rng))
+            if rng.uniform() < FAINT:
+                own = rng.uniform(FAINTEST, 1.0)
+                vessels = cv2.addWeighted(vessels, own, image, 1 - own, 0)
         if vessels is not image:
             cv2.copyTo(vessels, cv2.compare(labels, VESSELS, cv2.CMP_EQ), image)
         image = self._lit(image, labels, where_px, camera_from_world, rng)

@@ -36,13 +36,13 @@ class MicroscopeLook:
     specular_probability: float = 0.6
     fine_vessels: Range = (1.0, 8.0)  # number of thin arteries that the mesh does not have
     fine_vessels_probability: float = 0.4
-    blood_probability: float = 0.1
-    sponge_probability: float = 0.06
-    instrument_probability: float = 0.06
+    blood_probability: float = 0.15
+    sponge_probability: float = 0.1
+    instrument_probability: float = 0.15
     retractor_probability: float = 0.05
     circular_field: Range = (0.36, 0.6)  # radius
     circular_field_probability: float = 0.15
-    jpeg_quality: Range = (35.0, 95.0)
+    jpeg_quality: Range = (10.0, 95.0)
     jpeg_probability: float = 0.2
 
     def __post_init__(self) -> None:
@@ -215,30 +215,42 @@ def _draw_fine_vessels(image: np.ndarray, rng: np.random.Generator, look: Micros
 
 
 def _draw_blood(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A pool of blood: an irregular dark red blob with a soft edge."""
+    """Pools of blood: irregular red blobs, darker and lighter within, from a drop to a fifth of the field."""
     height, width = image.shape[:2]
     short_side = min(height, width)
-    angles = np.linspace(0, 2 * math.pi, 14, endpoint=False)
-    radii = rng.uniform(0.05, 0.18) * short_side * rng.uniform(0.6, 1.4, 14)
-    points = rng.uniform(0, 1, 2) * (width, height) + np.stack([np.cos(angles), np.sin(angles)], 1) * radii[:, None]
     mask = np.zeros((height, width), np.uint8)
-    cv2.fillPoly(mask, [np.rint(points).astype(np.int32)], 255, cv2.LINE_AA)
-    return _blend(image, mask, rng.uniform((50, 0, 0), (150, 30, 30)), rng.uniform(0.7, 1.0), 0.02 * short_side)
+    angles = np.linspace(0, 2 * math.pi, 14, endpoint=False)
+    for _ in range(rng.integers(1, 5)):
+        radii = rng.uniform(0.03, 0.2) * short_side * rng.uniform(0.6, 1.4, 14)
+        outline = rng.uniform(0, 1, 2) * (width, height) + radii[:, None] * np.stack(
+            [np.cos(angles), np.sin(angles)], 1
+        )
+        cv2.fillPoly(mask, [np.rint(outline).astype(np.int32)], 255, cv2.LINE_AA)
+    shades = rng.uniform(0.6, 1.4, (5, 5)).astype(np.float32)
+    shade = cv2.resize(shades, (width, height), interpolation=cv2.INTER_CUBIC)
+    red = rng.uniform(60, 180) * np.array([1.0, *rng.uniform(0.0, 0.25, 2)], np.float32)
+    colour = cv2.cvtColor(shade, cv2.COLOR_GRAY2RGB) * red
+    return _blend(image, mask, colour, rng.uniform(0.75, 1.0), rng.uniform(0.004, 0.02) * short_side)
 
 
 def _draw_instrument(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A straight grey shaft that enters from the border, with a lighter line along it."""
+    """A metal shaft from the border, or the two blades of a forceps, with bands of light and dark along it."""
     height, width = image.shape[:2]
     short_side, angle = min(height, width), rng.uniform(0, 2 * math.pi)
-    direction = np.array([math.cos(angle), math.sin(angle)])
-    tip = np.array([width, height]) * rng.uniform(0.2, 0.8, 2)
-    far = tip + direction * (height + width)
-    thickness, grey = rng.uniform(0.03, 0.12) * short_side, rng.uniform(60, 170)
-    for scale, shade in ((1.0, grey), (0.3, min(255.0, grey * 1.4))):
-        mask = np.zeros((height, width), np.uint8)
-        ends = [np.rint(end).astype(int).tolist() for end in (tip, far)]
-        cv2.line(mask, *ends, 255, max(1, round(thickness * scale)), cv2.LINE_AA)
-        image = _blend(image, mask, np.full(3, shade), 1.0, 0.0)
+    tip = np.array([width, height]) * rng.uniform(0.1, 0.9, 2)
+    thickness = rng.uniform(0.15, 0.45) ** 2 * short_side  # 2 to 20 %, more often thin
+    metal = rng.uniform(50, 210) + rng.uniform(-10, 10, 3)
+    bands = rng.uniform(0.5, 1.7, 4)
+    for blade in range(1 + (rng.random() < 0.3)):
+        direction = np.array([math.cos(angle + 0.2 * blade), math.sin(angle + 0.2 * blade)])
+        sideways = np.array([-direction[1], direction[0]])
+        start = tip + 2 * thickness * blade * sideways
+        for part, band in zip((1.0, 0.75, 0.5, 0.2), bands):
+            mask = np.zeros((height, width), np.uint8)
+            line = start + sideways * thickness * (1 - part) * rng.uniform(-0.4, 0.4)
+            ends = [np.rint(end).astype(int).tolist() for end in (line, line + direction * (height + width))]
+            cv2.line(mask, *ends, 255, max(1, round(thickness * part)), cv2.LINE_AA)
+            image = _blend(image, mask, np.clip(metal * band, 0, 255), 1.0, 0.05 * thickness)
     return image
 
 
@@ -246,18 +258,16 @@ def _draw_sponge(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A cotton patch: a pale woven rectangle, often stained."""
     height, width = image.shape[:2]
     short_side = min(height, width)
-    sides = rng.uniform(0.08, 0.3, 2) * short_side
+    sides = rng.uniform(0.08, 0.45, 2) * short_side
     centre = rng.uniform(0.1, 0.9, 2) * (width, height)
     corners = cv2.boxPoints((centre.tolist(), sides.tolist(), rng.uniform(0, 180)))
     mask = np.zeros((height, width), np.uint8)
     cv2.fillPoly(mask, [np.rint(corners * 16).astype(np.int32)], 255, cv2.LINE_AA, shift=4)
     stain = rng.uniform(0, 0.6)
     colour = (1 - stain) * rng.uniform(180, 250) + stain * rng.uniform((120, 20, 20), (200, 90, 80))
-    patch = np.empty_like(image)
-    patch[:] = colour.astype(np.uint8)
-    patch = cv2.add(patch, _noise(patch.shape, rng) * np.float32(rng.uniform(4, 25)), dtype=cv2.CV_8U)
-    cv2.copyTo(cv2.GaussianBlur(patch, (0, 0), 0.7), mask, image)
-    return image
+    weave = cv2.GaussianBlur(_noise((height, width), rng), (0, 0), rng.uniform(0.5, 2.5))
+    weave *= np.float32(rng.uniform(4, 25)) / max(weave.std(), np.float32(1e-6))
+    return _blend(image, mask, colour + weave[..., None], 1.0, 0.0)
 
 
 def _draw_retractor(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -287,12 +297,12 @@ def _draw_specular_spots(image: np.ndarray, rng: np.random.Generator, look: Micr
 
 
 def _blend(image: np.ndarray, mask: np.ndarray, colour: np.ndarray, opacity: float, edge_px: float) -> np.ndarray:
-    """`colour` over `image` where the uint8 mask says, with an edge softened over about `edge_px`."""
+    """`colour`, one or (H, W, 3), over `image` where the uint8 mask says, its edge softened over about `edge_px`."""
     if edge_px > 0.25:
         mask = cv2.GaussianBlur(mask, (0, 0), edge_px)
     alpha = mask * np.float32(opacity / 255)
     flat = np.empty_like(image)
-    flat[:] = np.asarray(colour, np.uint8)
+    flat[:] = np.clip(colour, 0, 255)
     return cv2.blendLinear(image, flat, 1 - alpha, alpha)
 
 
