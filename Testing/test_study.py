@@ -186,6 +186,15 @@ def test_a_finished_fold_is_trained_again_only_when_what_it_depends_on_changed(s
     assert len(calls(studied)) == 16
 
 
+def test_folds_are_trained_anew_where_the_craniotomy_was_moved(studied, no_pictures):
+    """Their training drew its poses around it; appearances and ranges stay as they are."""
+    for x_mm, trained in ((0.0, 3), (8.0, 6), (8.0, 6)):
+        craniotomy = {"centre_world_mm": [x_mm, 0.0, 0.0], "outward_axis": [0.0, 0.0, 1.0], "up": [0.0, 1.0, 0.0]}
+        Case.open(studied.case).record("render", ranges={"tilt_max_deg": 50.0}, craniotomy=craniotomy)
+        run(studied)
+        assert len(calls(studied)) == trained
+
+
 def test_frames_are_registered_anew_when_the_camera_beside_their_poses_was_corrected(studied, no_pictures, monkeypatch):
     """As intrinsics are that were wrong at first; the poses file itself, which names their file, stays the same."""
     told = []

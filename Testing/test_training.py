@@ -1,4 +1,5 @@
 import contextlib
+import copy
 import json
 import os
 import signal
@@ -122,6 +123,21 @@ def test_training_starts_at_the_shipped_weights_and_asks_for_them_when_it_goes_o
         assert torch.equal(state["down2.0.0.weight"], shipped["down2.0.0.weight"].float())
     monkeypatch.setattr(training, "load_start", lambda _network: False)
     assert trainer().state["settings"] != first.state["settings"]
+
+
+def test_a_training_begins_anew_where_the_craniotomy_was_moved(case, tmp_path):
+    """The appearances stay as they are where only its centre moved, since they show all of the surface: a finished
+    training would count as one on the poses around the new centre."""
+    from ExpectedAppearancesLib.model import training
+
+    moved = Case(case.folder, copy.deepcopy(case.manifest), case.camera)
+    moved.manifest["stages"]["render"]["craniotomy"]["centre_world_mm"][0] += 8.0
+    encoding = fit_encoding(np.stack([np.eye(4)] * 3), case.vessels.centroid_mm, case.vessels.radius_mm)
+    first, same, other = (
+        training._Trainer(one, TINY, encoding, CPU, 0, settings("surface"), tmp_path).state["settings"]
+        for one in (case, case, moved)
+    )
+    assert first == same != other
 
 
 def test_views_depend_only_on_seed_and_index_and_have_poses_of_their_own(case):

@@ -202,11 +202,14 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
     elif settings.robustness and not settings.protocols:
         problems.add(f"{folder}: has no model to test for robustness; run `train`, or study the protocol strict too.")
     problems.raise_if_any()
+    render = case.manifest["stages"].get("render", {})
     inputs = {
         "vessels_sha256": case.manifest["inputs"]["vessels"]["sha256"],
         "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
         "poses_sha256": files.sha256(poses_path),
-        "ranges": case.manifest["stages"].get("render", {}).get("ranges"),
+        # Training draws its poses in these ranges, around the craniotomy.
+        "ranges": render.get("ranges"),
+        "craniotomy": render.get("craniotomy"),
     }
     chosen = [style for style in styles if settings.styles is None or style in settings.styles]
     return StudyCase(case, poses_path, camera, frames, textures, styles, chosen, method, inputs)

@@ -157,7 +157,8 @@ class _Trainer:
             craniotomy.centre_world_mm, craniotomy.outward_axis, ranges.tilt_max_deg, tuple(distance)
         )
         self.appearances_sha256 = files.sha256(folder_of(case, views.method) / "index.json")
-        identity = f"{preset.to_dict()} {seed} {views} {self.appearances_sha256} {ranges}"
+        # The poses are drawn around the craniotomy, and what a regression's numbers mean comes from the poses.
+        identity = f"{preset.to_dict()} {seed} {views} {self.appearances_sha256} {ranges} {self.plausible.to_dict()}"
         identity += files.sha256(SHIPPED) if started else ""
         self.state = {
             "settings": {"sha256": hashlib.sha256(identity.encode()).hexdigest()},
