@@ -87,7 +87,7 @@ def test_normals_are_weighted_by_area():
 
 def test_vtp_keeps_every_digit(tmp_path):
     rng = np.random.default_rng(0)
-    mesh = Mesh(rng.normal(0, 30, (20, 3)), rng.permutation(20)[:18].reshape(6, 3).astype(np.int64))
+    mesh = Mesh(rng.normal(0, 30, (18, 3)), rng.permutation(18).reshape(6, 3).astype(np.int64))
     write_vtp(tmp_path / "ä.vtp", mesh)
     back = read_mesh(tmp_path / "ä.vtp", "mesh")
     assert np.array_equal(back.vertices_mm, mesh.vertices_mm)
@@ -121,7 +121,7 @@ def test_quads_and_strips_are_split_and_degenerate_triangles_dropped(tmp_path, c
         (polydata_of([]), "no triangles"),
         (sphere(0.02, (0, 0, 0)), "metres"),
         (sphere(5000.0), "2000 mm"),
-        (polydata_of([*SQUARE[:3], (float("nan"), 0, 0)], polygons=[(0, 1, 2)]), "not numbers"),
+        (polydata_of([*SQUARE[:3], (float("nan"), 0, 0)], polygons=[(0, 1, 2), (0, 2, 3)]), "not numbers"),
         (polydata_of(SQUARE, polygons=[(0, 1, 9)]), "does not exist"),
     ],
     ids=["lines", "empty", "metres", "huge", "nan", "index"],
@@ -183,6 +183,17 @@ def test_3d_slicer_reads_the_space_that_was_written(tmp_path):
         storage.SetCoordinateSystem(storage.CoordinateSystemRAS)
         assert storage.WriteData(node)
         assert declared_space(tmp_path / "b.vtp") == "RAS"
+
+
+def test_points_of_what_was_cut_away_are_no_vertices(tmp_path):
+    """As some programs leave them where faces were deleted: a patch that was cut out of a head lay in its middle."""
+    patch = dome(side_mm=20.0, cells=6)
+    far = np.random.default_rng(0).normal(0.0, 90.0, (300, 3))
+    polydata = Mesh(np.vstack([far, patch.vertices_mm]), patch.triangles + len(far)).to_polydata()
+    mesh = read_mesh(save(polydata, tmp_path / "a.vtp"), "mesh")
+    assert mesh.radius_mm == pytest.approx(patch.radius_mm)
+    np.testing.assert_allclose(mesh.centroid_mm, patch.centroid_mm, atol=1e-6)
+    np.testing.assert_allclose(mesh.vertices_mm[mesh.triangles], patch.vertices_mm[patch.triangles], atol=1e-5)
 
 
 def test_a_simplified_surface_has_few_triangles_and_stays_where_it_was():

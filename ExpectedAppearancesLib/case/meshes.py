@@ -92,8 +92,8 @@ class Mesh:
 
     @classmethod
     def from_polydata(cls, polydata) -> Mesh:
-        """Triangles of a vtkPolyData; polygons and strips are split, lines and degenerate triangles dropped. Points at
-        the same place become one vertex.
+        """Triangles of a vtkPolyData; polygons and strips are split, lines and degenerate triangles dropped, and so are
+        points of no triangle. Points at the same place become one vertex.
 
         Raises InputError when cells refer to points that do not exist.
         """
@@ -116,7 +116,11 @@ class Mesh:
         is_first, first = _first_at_each_place(vertices_mm)
         triangles = (np.cumsum(is_first) - 1)[first[triangles]]
         a, b, c = triangles.T
-        return cls(vertices_mm[is_first], triangles[(a != b) & (b != c) & (c != a)])
+        triangles = triangles[(a != b) & (b != c) & (c != a)]
+        # A mesh that was cut may keep the points of what was cut away: its middle and size would be those of all.
+        is_used = np.zeros(is_first.sum(), bool)
+        is_used[triangles] = True
+        return cls(vertices_mm[is_first][is_used], (np.cumsum(is_used) - 1)[triangles])
 
 
 def _first_at_each_place(vertices_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
