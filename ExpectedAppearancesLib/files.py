@@ -89,11 +89,21 @@ def read_image_rgb(path: Path) -> np.ndarray:
         return read_video_frame(path)
     if not path.is_file():
         raise InputError(f"{path}: image not found; check the path.")
-    # Through bytes: cv2.imread fails on non-ASCII paths on Windows.
-    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR) if path.stat().st_size else None
+    image = _decoded(path, cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path}: not an image that can be read (or damaged); give a PNG, JPEG or TIFF file.")
     return np.ascontiguousarray(image[..., ::-1])
+
+
+def _decoded(path: Path, mode: int) -> np.ndarray | None:
+    """As cv2.imread, which fails on non-ASCII paths on Windows; None for what is no image."""
+    import cv2
+
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    try:
+        return cv2.imdecode(data, mode) if data.size else None
+    except cv2.error:  # the size that a damaged header tells
+        return None
 
 
 def read_label_map(path: Path) -> np.ndarray:
@@ -103,8 +113,7 @@ def read_label_map(path: Path) -> np.ndarray:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: label map not found; check the path.")
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    labels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    labels = _decoded(path, cv2.IMREAD_UNCHANGED)
     if labels is None:
         raise InputError(f"{path}: label map cannot be read (or damaged); save it as an 8-bit grey PNG.")
     if labels.ndim == 3:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from types import SimpleNamespace
 
 import cv2
@@ -194,9 +195,15 @@ def test_damaged_images_are_all_named(case, known, tmp_path):
     images = [frame.image for frame in read_poses(known)[1]]
     for i in (1, 2):
         images[i].write_bytes(images[i].read_bytes()[:20])
+    data = bytearray(images[3].read_bytes())
+    data[16:24] = b"\x00\x0d\xbb\xa0" * 2  # 900,000 x 900,000 px, which OpenCV does not even try
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    images[3].write_bytes(data)
     with pytest.raises(InputError) as caught:
         evaluate(case, known, tmp_path / "out", predictor=ShiftedPredictor(known))
-    assert len(caught.value.problems) == 2 and str(images[2]) in caught.value.problems[1]
+    assert [str(images[i]) in caught.value.problems[i - 1] for i in (1, 2, 3)] == [True] * 3
+    with pytest.raises(InputError, match=r"3\.png: label map cannot be read"):
+        files.read_label_map(images[3])
     assert not (tmp_path / "out").exists()
 
 
