@@ -13,10 +13,10 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.evaluation import overlays
+from ExpectedAppearancesLib.evaluation import curves, overlays
 from ExpectedAppearancesLib.evaluation.curves import curve_points
 from ExpectedAppearancesLib.evaluation.evaluate import evaluate
-from ExpectedAppearancesLib.evaluation.metrics import frame_errors
+from ExpectedAppearancesLib.evaluation.metrics import frame_errors, metrics
 from ExpectedAppearancesLib.evaluation.report import headline, text_table
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
@@ -217,6 +217,15 @@ def test_a_frame_that_does_not_fit_the_camera_is_named(case, known, tmp_path):
     with pytest.raises(InputError, match=r"1\.png: the frame is 128 x 96 px") as error:
         evaluate(case, known, tmp_path / "out", predictor=OfOneSize(known))
     assert len(error.value.problems) == 1
+
+
+def test_the_bars_of_a_style_without_any_pose_do_not_say_0_mm(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(curves, "write_figure", lambda _path, figure: figures.append(figure))
+    errors = frame_errors(np.eye(3), [np.eye(4)] * 4, [np.eye(4), pose_from_rotation(np.eye(3), (8, 0, 0)), None, None])
+    curves.write_style_bars(tmp_path / "styles.png", metrics(errors, ["day", "day", "night", "night"]))
+    shown = [[text.get_text() for text in axes.texts] for axes in figures[0].axes]
+    assert shown == [["4.00", "no pose"] * 2, ["50", "0"] * 2]
 
 
 def test_curve_points_rise_to_the_share_that_has_a_pose():

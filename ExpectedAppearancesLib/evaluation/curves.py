@@ -83,9 +83,11 @@ def write_style_bars(path: Path, metrics: dict) -> None:
     )
     for axes, x_label, scale, bars in panels:
         for offset, (name, colour, (group, key)) in zip((-0.2, 0.2), bars):
-            values = [scale * (figures[group][key] or 0) for figures in styles.values()]
-            drawn = axes.barh(rows + offset, values, 0.38, color=colour, label=name)
-            axes.bar_label(drawn, [f"{v:.2f}" if scale == 1 else f"{v:.0f}" for v in values], padding=2, fontsize=7)
+            values = [figures[group][key] for figures in styles.values()]
+            drawn = axes.barh(rows + offset, [scale * (v or 0) for v in values], 0.38, color=colour, label=name)
+            # Where no frame has a pose there is no ADD, and 0 would be the best there is.
+            shown = ["no pose" if v is None else f"{scale * v:.{2 if scale == 1 else 0}f}" for v in values]
+            axes.bar_label(drawn, shown, padding=2, fontsize=7)
         axes.set(xlabel=x_label, xlim=(0, 112 if scale == 100 else axes.get_xlim()[1] * 1.1))
         axes.grid(axis="x", alpha=0.3)
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
