@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -25,15 +26,34 @@ def grey(level: int, size: int = 96) -> np.ndarray:
     return np.full((size, size, 3), (level, level // 2, 60), np.uint8)
 
 
-@pytest.fixture
-def video(tmp_path):
-    """20 frames at 12.5 Hz, each told by its red."""
-    path = tmp_path / "Op ä.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 12.5, (96, 96))
+def write_video(path, codec: str, rate_hz: float = 25) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate_hz, (96, 96))
     for level in LEVELS:
         writer.write(np.ascontiguousarray(grey(level)[..., ::-1]))
     writer.release()
-    return path
+
+
+def unequal_durations(data: bytearray) -> None:
+    """Of an MP4 of 20 frames: each of the second ten lasts four times as long."""
+    at = data.index(b"stts") - 4
+    size, count, ticks = *struct.unpack_from(">I", data, at), *struct.unpack_from(">II", data, at + 16)
+    assert (size, count) == (24, 20)  # one run of equal ones, which becomes two
+    data[at : at + size] = struct.pack(">I4s6I", 32, b"stts", 0, 2, 10, ticks, 10, 4 * ticks)
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):  # that it lies in; all behind the frames
+        box = data.index(name) - 4
+        struct.pack_into(">I", data, box, struct.unpack_from(">I", data, box)[0] + 8)
+    for name, place in ((b"mvhd", 20), (b"tkhd", 24), (b"mdhd", 20)):
+        duration = data.index(name) + place
+        struct.pack_into(">I", data, duration, struct.unpack_from(">I", data, duration)[0] * 5 // 2)
+    edits = data.index(b"edts")
+    data[edits : edits + 4] = b"free"
+
+
+@pytest.fixture
+def video(tmp_path):
+    """20 frames at 12.5 Hz, each told by its red."""
+    write_video(tmp_path / "Op ä.avi", "MJPG", 12.5)
+    return tmp_path / "Op ä.avi"
 
 
 def test_video_gives_its_frames_in_rgb_with_their_times(video):
@@ -49,17 +69,27 @@ def test_video_gives_its_frames_in_rgb_with_their_times(video):
 
 @pytest.mark.parametrize(("suffix", "codec"), [(".avi", "MJPG"), (".mp4", "mp4v")])
 def test_a_written_frame_can_be_read_again(tmp_path, suffix, codec):
-    path = tmp_path / f"v{suffix}"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, (96, 96))
-    for level in LEVELS:
-        writer.write(np.ascontiguousarray(grey(level)[..., ::-1]))
-    writer.release()
+    write_video(tmp_path / f"v{suffix}", codec)
     for number in (13, 0, 19):
         image = files.read_image_rgb(tmp_path / f"v{suffix}#frame={number}")
         np.testing.assert_allclose(image[40, 40], grey(LEVELS[number])[0, 0], atol=6)
     for wrong in (f"v{suffix}#frame=20", f"v{suffix}#frame=x", f"w{suffix}#frame=1"):
         with pytest.raises(InputError, match=wrong):
             files.read_image_rgb(tmp_path / wrong)
+
+
+def test_a_frame_is_found_where_frames_are_not_equally_long(tmp_path):
+    """As recorders write them that leave frames out: by the mean rate another frame is found, or none."""
+    path = tmp_path / "v.mp4"
+    write_video(path, "mp4v")
+    data = bytearray(path.read_bytes())
+    unequal_durations(data)
+    path.write_bytes(data)
+    frames = list(Footage([path]))
+    np.testing.assert_allclose(np.diff([f.time_s for f in frames]), [0.04] * 10 + [0.16] * 9, atol=1e-6)
+    for number in (17, 18, 3, 19, 3):
+        image = files.read_image_rgb(tmp_path / f"v.mp4#frame={number}")
+        np.testing.assert_array_equal(image, frames[number].read_rgb())
 
 
 def test_a_given_rate_replaces_the_videos_and_times_images(video, tmp_path):

@@ -210,10 +210,11 @@ def overlay_images(case: Case, evaluation: Evaluation, indices: Iterable[int]) -
     parenchyma = parenchyma_of(case, craniotomy_of(case))
     renderers: dict[Camera, MaskRenderer] = {}
     results = []
+    indices = list(indices)
+    images = {index: files.read_image_rgb(evaluation.true[index].image) for index in sorted(indices)}  # as a video runs
     try:
         for index in indices:
-            true, predicted = evaluation.true[index], evaluation.predicted[index]
-            image = files.read_image_rgb(true.image)
+            true, predicted, image = evaluation.true[index], evaluation.predicted[index], images[index]
             height, width = image.shape[:2]
             scale = max(1, round(_SHOWN_SIDE_PX / min(height, width)))
             image = undistorted(image, evaluation.camera.resized(width, height))

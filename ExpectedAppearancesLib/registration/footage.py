@@ -17,6 +17,7 @@ VIDEO_SUFFIXES = frozenset(
 )
 FRAME_MARK = "#frame="  # parts a video's path from the number of one of its frames
 LARGEST_RATE_HZ = 1000.0  # containers without a frame rate report 0, or their clock's ticks
+_last_read: dict[tuple, tuple] = {}  # by video and its time of change: what plays it, and the frame that follows
 
 
 @dataclass(frozen=True)
@@ -111,20 +112,21 @@ def is_there(image: Path) -> bool:
 
 def read_video_frame(path: Path) -> np.ndarray:
     """The frame that a path VIDEO#frame=N names, uint8 RGB (H, W, 3). Raises InputError."""
-    import cv2
-
     named = video_and_number(path)
     if named is None or not named[0].is_file():
         raise InputError(f"{path}: video not found; check the path.")
     video, number = named
-    capture = _open(video)
-    try:
-        capture.set(cv2.CAP_PROP_POS_FRAMES, number)
-        found, image = capture.read()
-    finally:
-        capture.release()
+    version = (video, video.stat().st_mtime_ns)
+    # Frames are counted from the first one: where they are not equally long OpenCV's search finds others.
+    capture, following = _last_read.pop(version, (None, 0))
+    if capture is None or number < following:
+        _last_read.clear()
+        capture, following = _open(video), 0
+    found = all(capture.grab() for _ in range(number - following))
+    found, image = capture.read() if found else (False, None)
     if not found:
         raise InputError(f"{path}: the video has no such frame; register it again.")
+    _last_read[version] = capture, number + 1  # mostly the next one is asked for
     return np.ascontiguousarray(image[..., ::-1])
 
 
