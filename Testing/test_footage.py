@@ -168,6 +168,14 @@ def test_register_without_track_is_as_before(case, video, tmp_path):
     assert "tracking" not in first and first["image"] == "Op ä.avi#frame=0" and first["time_s"] == 0
 
 
+def test_register_says_before_it_begins_that_its_file_cannot_be_written(case, video, tmp_path, capsys, monkeypatch):
+    """After an hour's video its poses would be lost."""
+    monkeypatch.setattr(SteadyPredictor, "predict", lambda *_: pytest.fail("registered for nothing"))
+    for out, words in ((tmp_path, "is a folder"), (video / "poses.json", "nothing can be written here")):
+        assert main(["register", str(case.folder), str(video), "--out", str(out)]) == 2
+        assert words in capsys.readouterr().err
+
+
 def test_frames_of_a_video_can_be_evaluated(case, video, tmp_path):
     registered, known = tmp_path / "registered.json", tmp_path / "known.json"
     assert main(["register", str(case.folder), str(video), "--out", str(registered)]) == 0

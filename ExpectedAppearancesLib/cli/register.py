@@ -33,7 +33,7 @@ def run(args, progress) -> None:
     from ..errors import InputError, Problems
     from ..geometry.camera import read_camera
     from ..registration.footage import Footage
-    from ..registration.poses_file import write_poses
+    from ..registration.poses_file import check_place, write_poses
     from ..registration.predictor import open_predictor
     from ..registration.record import frame_record, tracking_record
     from ..registration.tracking import Tracker, TrackerSettings, TrackState
@@ -49,6 +49,8 @@ def run(args, progress) -> None:
             predictor = open_predictor(case)
     with problems.collect():
         footage = Footage(args.images, args.fps)
+    with problems.collect():  # a long video's poses must not be lost for want of a place
+        check_place(args.out)
     if footage and args.track and not footage.is_video and args.fps is None:
         problems.add("--track: images carry no time; give their frames per second with --fps.")
     if predictor and args.track and not predictor.gives_covariance:
