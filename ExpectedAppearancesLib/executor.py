@@ -14,7 +14,8 @@ LOCAL = "local"
 _ADDRESS = re.compile(r"dask://(?P<host>\[[0-9a-fA-F:]+\]|[^/:\s]+):(?P<port>\d{1,5})/?")
 CONNECT_S = 15  # that a scheduler is given to answer
 STOP_S = 60.0  # that workers are given to end what they do
-ASK_EVERY_S = 2.0  # how often a worker asks whether it should stop
+ASK_EVERY_S = 2.0  # how often a worker asks whether it should stop, and how it goes on is asked
+NO_WORKER = "the scheduler has no worker: start `dask worker`"
 
 ProgressFunction = Callable[[float, str], None]
 # job, progress, stopped -> None; importable by name, since another machine runs it
@@ -65,16 +66,26 @@ def run_jobs(jobs: Sequence, work: Work, executor: str, progress: ProgressFuncti
         return
     if not jobs:
         return
-    from distributed import Event, TimeoutError, as_completed, wait
+    from distributed import Event, TimeoutError, wait
 
     with connect(executor) as client, client.as_current():
         stop = f"expected-appearances-{uuid.uuid4()}"
         event = Event(stop, client=client)
         futures = [client.submit(_on_worker, work, job, stop, pure=False, retries=0) for job in jobs]
         try:
-            for done, future in enumerate(as_completed(futures), 1):
-                future.result()
-                progress(done / len(jobs), f"{done} of {len(jobs)} done at {executor}")
+            waiting, told = list(futures), None
+            while waiting:
+                with contextlib.suppress(TimeoutError):
+                    wait(waiting, timeout=ASK_EVERY_S, return_when="FIRST_COMPLETED")
+                ended = next((i for i, future in enumerate(waiting) if future.done()), None)
+                if ended is not None:
+                    waiting.pop(ended).result()
+                done = len(jobs) - len(waiting)
+                text = f"{done} of {len(jobs)} done at {executor}"
+                text = text if not waiting or client.nthreads() else NO_WORKER
+                if text != told:
+                    told = text
+                    progress(done / len(jobs), text)
         except BaseException:
             event.set()
             with contextlib.suppress(TimeoutError):

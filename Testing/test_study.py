@@ -395,7 +395,23 @@ def test_jobs_run_on_a_cluster(cluster, tmp_path):
     heard = []
     executor.run_jobs([(str(tmp_path), n) for n in "xyz"], note_work, cluster, lambda f, _text: heard.append(f))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x", "y", "z"]
-    assert heard == pytest.approx([1 / 3, 2 / 3, 1])
+    assert [fraction for fraction in heard if fraction] == pytest.approx([1 / 3, 2 / 3, 1])
+
+
+def test_a_study_whose_cluster_has_no_worker_says_so(tmp_path, monkeypatch):
+    """It waits for one as long as it takes, as after the last one was killed."""
+    distributed = pytest.importorskip("dask.distributed", reason="dask.distributed is not installed")
+    monkeypatch.setattr(executor, "ASK_EVERY_S", 0.1)
+    monkeypatch.setattr(executor, "STOP_S", 0.1)
+
+    def told(_fraction, message):
+        if "no worker" in message:
+            raise CancelledError(message)
+
+    nobody = distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=":0")
+    with nobody, pytest.raises(CancelledError, match="start `dask worker`"):
+        address = "dask://" + nobody.scheduler_address.removeprefix("tcp://")
+        executor.run_jobs([(str(tmp_path), "x")], note_work, address, told)
 
 
 def test_a_failing_job_of_a_cluster_stops_the_others(cluster, tmp_path):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from ..errors import ExpectedAppearancesError
-from ..executor import LOCAL, check_executor, connect
+from ..executor import LOCAL, NO_WORKER, check_executor, connect
 from .claims import ClaimLost
 from .shards import Recipe, Shard, work_on
 
@@ -70,7 +70,7 @@ def _run_on_dask(shards: list[Shard], recipe: Recipe, executor: str, on_progress
                 else:
                     done += len(shard.items)
             at_work = f"{len(running)} shards on the cluster"
-            on_progress(done, at_work if client.nthreads() else "the scheduler has no worker: start `dask worker`")
+            on_progress(done, at_work if client.nthreads() else NO_WORKER)
             if held and not running:
                 time.sleep(POLL_S)
             waiting += held
