@@ -1,5 +1,6 @@
 import pytest
 
+from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.demo import pipeline
 from ExpectedAppearancesLib.errors import ExpectedAppearancesError, InputError
 
@@ -9,6 +10,15 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     with pytest.raises(InputError, match="is no demo"):
         pipeline.run_demo(tmp_path, lambda *_: None)
     assert (tmp_path / "thesis.tex").read_text() == "years of work" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_demo_of_other_settings_is_left_alone(tmp_path):
+    """What was made in it since, such as a study, took hours."""
+    files.write_json(tmp_path / "demo.json", {"seed": 2, "minutes": 22.0, "textures": 10})
+    files.write_json(tmp_path / "case" / "study" / "study.json", {})
+    with pytest.raises(InputError, match=r"seed 2, minutes 22\.0, textures 10"):
+        pipeline.run_demo(tmp_path, lambda *_: None)
+    assert (tmp_path / "case" / "study" / "study.json").is_file()
 
 
 def test_a_failing_stage_ends_the_demo_and_is_named(tmp_path):

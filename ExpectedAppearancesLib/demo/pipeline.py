@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -30,7 +29,8 @@ TILT_DEG = 50.0  # a planned craniotomy is seen from a cone around its axis; the
 def run_demo(
     out: Path, progress: Callable[[float, str], None], seed: int = 0, minutes: float = 6.0, textures: int = 6
 ) -> dict:
-    """Run all stages into `out`; returns metrics.json. Raises InputError when `out` holds something else."""
+    """Run all stages into `out`; returns metrics.json. Raises InputError when `out` holds something else, or a demo
+    of other settings: what was made there since, a longer training or a study, is not to be deleted."""
     out = Path(out)
     marker = out / "demo.json"
     settings = {"seed": seed, "minutes": minutes, "textures": textures}
@@ -39,7 +39,8 @@ def run_demo(
         if not known:
             raise InputError(f"{out}: exists and is no demo; give a new folder with --out.")
         if known != settings:
-            shutil.rmtree(out)
+            made = ", ".join(f"{name} {known.get(name)}" for name in settings)
+            raise InputError(f"{out}: holds a demo of other settings ({made}); give these, or a new folder with --out.")
     files.write_json(marker, settings)
 
     progress(0.0, "generating a vessel tree on a curved cortex, and unseen test frames")
