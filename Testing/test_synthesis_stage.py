@@ -7,13 +7,14 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from cases import texture, write_inputs
+from cases import dome, texture, write_inputs
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import claims, store
 from ExpectedAppearancesLib.appearances.claims import ClaimLost, Claims
 from ExpectedAppearancesLib.appearances.stage import synthesize_case
 from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.masks.stage import read_rendered, render_case
@@ -89,6 +90,18 @@ def test_label_maps_of_an_interrupted_drawing_are_not_taken_for_the_views_of_the
         synthesize_case(case, [texture("a")], lambda *_: None, "image", size_px=32, iterations=1)
     render_case(case, lambda *_: None, poses=4, seed=1)
     assert len(read_rendered(case)) == 4
+
+
+def test_vessels_that_the_cortex_hides_in_all_views_are_told_before_hours_of_work(tmp_path):
+    """As those of a scan below the surface of the dura or the head."""
+    paths = write_inputs(tmp_path)
+    above = dome()
+    write_vtp(paths["cortex.vtp"], Mesh(above.vertices_mm + np.array([0, 0, 4.0]), above.triangles))
+    case = Case.create(tmp_path / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
+    with pytest.raises(InputError, match="none of the label maps shows a vessel"):
+        render_case(case, lambda *_: None, poses=2)
+    with pytest.raises(InputError, match="run `render`"):
+        read_rendered(case)
 
 
 def test_paper_preset_makes_every_pose_with_every_texture(case):

@@ -13,6 +13,7 @@ from ..case.meshes import Mesh
 from ..errors import InputError
 from ..poses.craniotomy import Craniotomy, find_craniotomy, parenchyma_around
 from ..poses.sampling import PoseRanges, PoseSampler
+from .labels import VESSELS
 from .renderer import MaskRenderer
 
 DEFAULT_POSES = 100
@@ -93,6 +94,11 @@ def render_case(
             if not path.is_file():
                 files.write_png(path, renderer.render(matrix))
             progress((i + 1) / poses, f"label map {i + 1} of {poses}")
+    if not any((files.read_label_map(case.masks_folder / f"{i:05d}.png") == VESSELS).any() for i in range(poses)):
+        raise InputError(
+            f"{case.folder}: none of the label maps shows a vessel, the cortex hides them all; make the case with a "
+            "cortex that does not lie over them, or with none."
+        )
     frames = [
         {"labels": f"../masks/{i:05d}.png", "camera_from_world": matrix.tolist()} for i, matrix in enumerate(matrices)
     ]
