@@ -186,6 +186,15 @@ def test_a_finished_fold_is_trained_again_only_when_what_it_depends_on_changed(s
     assert len(calls(studied)) == 16
 
 
+def test_folds_of_an_older_version_are_trained_anew(studied, no_pictures, monkeypatch):
+    """A study that goes on after an update ended, after its other trainings, with a model that cannot be read."""
+    monkeypatch.setattr(study, "MODEL_VERSION", study.MODEL_VERSION - 1)
+    run(studied, replace(QUICK, styles=("a",)))
+    monkeypatch.undo()
+    jobs = study._jobs(study._open(studied.case, studied.poses, QUICK), QUICK)
+    assert not any(map(study_folds.is_trained, jobs))
+
+
 def test_folds_are_trained_anew_where_the_craniotomy_was_moved(studied, no_pictures):
     """Their training drew its poses around it; appearances and ranges stay as they are."""
     for x_mm, trained in ((0.0, 3), (8.0, 6), (8.0, 6)):

@@ -21,6 +21,7 @@ from ..executor import LOCAL, check_executor, run_jobs
 from ..geometry.camera import Camera
 from ..model.presets import PRESETS
 from ..registration.poses_file import Frame, read_poses, write_poses
+from ..registration.predictor import FORMAT_VERSION as MODEL_VERSION
 from .curves import curve_points
 from .evaluate import Evaluation, check_out, compare, known_frames, overlay_images, register_frames
 from .metrics import add_auc, add_mm
@@ -233,7 +234,8 @@ def _job(one: StudyCase, settings: StudySettings, preset: str, protocol: str, na
     given = {key: getattr(settings, key) for key in ("steps", "minutes") if getattr(settings, key) is not None}
     inputs = {key: value for key, value in one.inputs.items() if key != "poses_sha256" or protocol == "loto"}
     identity = {"preset": replace(PRESETS[preset], **given).to_dict(), "seed": settings.seed, "protocol": protocol}
-    identity |= {"exclude": list(exclude), "method": one.method, "inputs": inputs}
+    # A model of an older version cannot be read any more.
+    identity |= {"exclude": list(exclude), "method": one.method, "inputs": inputs, "model_version": MODEL_VERSION}
     return FoldJob(
         str(one.case.folder),
         f"{preset}-{protocol}-{name}",
