@@ -26,7 +26,7 @@ from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.geometry.pose import transform
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.masks.stage import craniotomy_of, parenchyma_of, read_rendered, render_case
-from ExpectedAppearancesLib.model import views
+from ExpectedAppearancesLib.model import checkpoint, views
 from ExpectedAppearancesLib.model.encoding import fit_encoding, network_camera
 from ExpectedAppearancesLib.model.feeder import Feeder, draw_views
 from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
@@ -390,6 +390,25 @@ def test_a_damaged_checkpoint_is_not_gone_on_from(trained):
     path = trained.model_folder / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     assert train_case(trained, replace(TINY, steps=2), lambda *_: None, CPU, method="surface")["steps"] == 2
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no limit for the size of files")
+def test_a_checkpoint_that_does_not_fit_on_the_disk_is_told_in_words(tmp_path):
+    """The library that writes it has an error of its own for that, which names no file and no way out."""
+    network = torch.nn.Linear(300, 300)
+    optimizer = torch.optim.AdamW(network.parameters())
+    import resource
+
+    usual = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"checkpoint\.safetensors: cannot be written .*free some space"):
+            checkpoint.save(tmp_path, network, {}, {}, optimizer, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, usual)
+    assert not list(tmp_path.iterdir())
 
 
 def test_training_without_appearances_says_what_to_run(tmp_path):

@@ -25,7 +25,10 @@ def save(folder: Path, network, average: dict, best: dict, optimizer, state: dic
         tensors |= {f"adam.{names[i]}.{k}": torch.as_tensor(v) for k, v in moments.items()}
     tensors = {k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}
     with files.replacing(folder / NAME) as temporary:
-        save_file(tensors, str(temporary), metadata={"state": json.dumps(state)})
+        try:
+            save_file(tensors, str(temporary), metadata={"state": json.dumps(state)})
+        except SafetensorError as error:  # its own for what is an OSError elsewhere, such as a full disk
+            raise OSError(str(error)) from error
 
 
 def load(folder: Path, network, optimizer, settings: dict) -> tuple[dict, dict, dict] | None:
