@@ -8,10 +8,12 @@ from ..case.meshes import Mesh
 
 
 def exposed_vessels(vessels: Mesh, parenchyma: Mesh, outward_axis: np.ndarray) -> Mesh:
-    """`vessels` cut where they enter the parenchyma; all of them where nothing would be left. Both in world mm."""
+    """`vessels` cut where they enter the parenchyma, all of them where nothing would be left; their triangles face
+    outwards. Both in world mm."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkFiltersCore import vtkClipPolyData, vtkImplicitPolyDataDistance
 
+    vessels = _facing_outwards(vessels, outward_axis)
     surface = vtkImplicitPolyDataDistance()
     surface.SetInput(parenchyma.to_polydata())
     height_mm = np.array([surface.EvaluateFunction(vertex) for vertex in vessels.vertices_mm])
@@ -28,3 +30,13 @@ def exposed_vessels(vessels: Mesh, parenchyma: Mesh, outward_axis: np.ndarray) -
     clip.SetValue(0.0)
     clip.Update()
     return Mesh.from_polydata(clip.GetOutput())
+
+
+def _facing_outwards(vessels: Mesh, outward_axis: np.ndarray) -> Mesh:
+    """With all triangles turned where they face inwards, as a mirroring leaves them: the border on the far side of such
+    vessels would be taken for a part of the outline."""
+    # The volume inside, seen from below: where the surface is open there, what lies below it counts as well.
+    below_mm = vessels.centroid_mm - outward_axis * vessels.radius_mm
+    a, b, c = (vessels.vertices_mm[vessels.triangles[:, i]] - below_mm for i in range(3))
+    volume = np.einsum("ij,ij->", a, np.cross(b, c))
+    return vessels if volume >= 0 else Mesh(vessels.vertices_mm, np.ascontiguousarray(vessels.triangles[:, ::-1]))
