@@ -7,12 +7,15 @@ import hashlib
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from .errors import InputError
+
+READERS_TAKE_S = 2.0  # at most, for a file
 
 
 @contextlib.contextmanager
@@ -39,10 +42,23 @@ def replacing(path: Path) -> Iterator[Path]:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
-            os.replace(temporary, path)
+            _replace(temporary, path)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """os.replace, which on Windows fails as long as another process reads `path`, as the panel does now and then."""
+    deadline = time.monotonic() + READERS_TAKE_S
+    while True:
+        try:
+            os.replace(temporary, path)
+            return
+        except PermissionError:
+            if path.is_dir() or time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -177,6 +177,25 @@ def test_a_drive_that_is_not_there_is_refused(tmp_path, inputs, monkeypatch):
         create(tmp_path / "case", inputs)
 
 
+def test_a_file_that_somebody_reads_is_replaced_when_he_has_done(tmp_path, monkeypatch):
+    """Windows takes no file away from who reads it: a training ended where the panel looked at its checkpoint."""
+    path, replace, times = tmp_path / "a.json", os.replace, iter([1, 1, 0])
+    path.write_text("old")
+
+    def read_by_another(source, target):
+        if next(times, 1):
+            raise PermissionError(errno.EACCES, "Access is denied")
+        replace(source, target)
+
+    monkeypatch.setattr(files.os, "replace", read_by_another)
+    files.write_json(path, {"new": 1})
+    assert json.loads(path.read_text()) == {"new": 1} and [p.name for p in tmp_path.iterdir()] == ["a.json"]
+    monkeypatch.setattr(files, "READERS_TAKE_S", 0.05)
+    with pytest.raises(InputError, match=r"a\.json: cannot be written \(Access is denied\)"):
+        files.write_json(path, {"new": 2})
+    assert json.loads(path.read_text()) == {"new": 1}
+
+
 def test_record_on_a_full_disk_keeps_the_manifest(tmp_path, inputs, monkeypatch):
     case = create(tmp_path / "case", inputs)
     before = (tmp_path / "case" / "case.json").read_bytes()
