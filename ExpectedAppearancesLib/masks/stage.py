@@ -97,7 +97,7 @@ def render_case(
     if not any((files.read_label_map(case.masks_folder / f"{i:05d}.png") == VESSELS).any() for i in range(poses)):
         raise InputError(
             f"{case.folder}: none of the label maps shows a vessel, the cortex hides them all; make the case with a "
-            "cortex that does not lie over them, or with none."
+            "cortex that does not lie over them, or with none, or give the axis that points out of the head."
         )
     frames = [
         {"labels": f"../masks/{i:05d}.png", "camera_from_world": matrix.tolist()} for i, matrix in enumerate(matrices)
