@@ -362,6 +362,15 @@ def test_all_problems_at_once_and_nothing_trained(studied, tmp_path, capsys):
         run(studied)
 
 
+def test_frames_that_cannot_be_registered_are_told_before_anything_is_trained(studied):
+    (studied.poses.parent / "2.png").write_bytes(b"cut")
+    files.write_png(studied.poses.parent / "7.png", np.zeros((96, 128, 3), np.uint8))
+    with pytest.raises(InputError) as caught:
+        run(studied)
+    assert [name in text for name, text in zip(("2.png", "7.png"), caught.value.problems)] == [True, True]
+    assert not calls(studied)
+
+
 def test_a_model_that_cannot_be_tested_for_robustness_is_told_before_anything_is_trained(studied, monkeypatch):
     monkeypatch.setattr("ExpectedAppearancesLib.registration.predictor.Predictor", Predictor)
     files.write_json(studied.case / "model" / "model.json", {"format_version": 1})

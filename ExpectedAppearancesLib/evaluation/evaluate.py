@@ -127,6 +127,17 @@ def known_frames(path: Path, styles: Sequence[str] | None, case_camera: Camera) 
     return camera or case_camera, frames
 
 
+def check_frame(frame: Frame, camera: Camera) -> None:
+    """Raise InputError when the image of a frame cannot be read, or is none that the camera takes."""
+    from ..registration.predictor import fitted_camera
+
+    height, width = files.read_image_rgb(frame.image).shape[:2]
+    try:
+        fitted_camera(camera, width, height)
+    except InputError as error:
+        raise InputError(f"{frame.image}: {error}") from error
+
+
 def _pair(true: Iterable[Frame], path: Path) -> list[Frame]:
     """The frames of `path` with the images of `true`, in that order. Raises InputError naming those that lack."""
     by_image = {frame.image: frame for frame in read_poses(path)[1]}

@@ -23,7 +23,7 @@ from ..model.presets import PRESETS
 from ..registration.poses_file import Frame, read_poses, write_poses
 from ..registration.predictor import FORMAT_VERSION as MODEL_VERSION
 from .curves import curve_points
-from .evaluate import Evaluation, check_out, compare, known_frames, overlay_images, register_frames
+from .evaluate import Evaluation, check_frame, check_out, compare, known_frames, overlay_images, register_frames
 from .metrics import add_auc, add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
@@ -195,6 +195,10 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
         )
     if settings.textures_study and len(styles) < LEFT_OUT:
         problems.add(f"{poses_path}: has frames of {len(styles)} textures; --textures-study tests on {LEFT_OUT}.")
+    for frame in frames:  # one that cannot be read would end the study after all its trainings
+        if frame.style in styles:
+            with problems.collect():
+                check_frame(frame, camera)
     if settings.robustness and (case.model_folder / "model.onnx").is_file():
         from ..registration.predictor import open_predictor
 
