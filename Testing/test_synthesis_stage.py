@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -192,6 +193,16 @@ def test_a_claim_of_a_dead_process_is_taken_over_once(tmp_path):
     process.stdout.close()
     heirs = [Claims(tmp_path).take("a") for _ in range(3)]
     assert [heir is not None for heir in heirs] == [True, False, False]
+
+
+def test_the_copy_of_a_folder_is_not_held_by_who_works_on_the_original(tmp_path):
+    """Copied while a synthesis went on, a case could not be worked on until that had ended, without a word."""
+    original = tmp_path / "original"
+    assert Claims(original).take("a")
+    shutil.copytree(original, tmp_path / "copy")
+    assert Claims(tmp_path / "copy").take("a") and Claims(original).take("a") is None
+    original.rename(tmp_path / "moved")
+    assert Claims(tmp_path / "moved").take("a") is None
 
 
 def test_a_silent_holder_on_another_machine_is_given_up_and_told_so(tmp_path, monkeypatch):

@@ -80,7 +80,7 @@ class Claims:
             except FileExistsError:
                 return None
             with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-                json.dump(_own_identity(), stream)
+                json.dump(_own_identity() | {"folder": str(self.folder.absolute())}, stream)
         return Claim(stem, generation)
 
     def withdraw(self, name: str) -> None:
@@ -98,12 +98,20 @@ class Claims:
             holder, beaten = {}, path.stat().st_mtime_ns
         own = _own_identity()
         if holder.get("machine") == own["machine"]:
-            return not _runs(holder)
+            return not _runs(holder) or self._is_of_the_original(holder)
         seen, since_s = self._seen.get(path, (None, 0.0))
         if seen != beaten:
             self._seen[path] = beaten, time.monotonic()
             return False
         return time.monotonic() - since_s > STALE_S
+
+    def _is_of_the_original(self, holder: dict) -> bool:
+        """Whether this folder is a copy of the one that the holder works in, made meanwhile; not where that was moved
+        to here."""
+        try:
+            return not os.path.samefile(holder.get("folder", self.folder), self.folder)
+        except OSError:
+            return False
 
 
 def _file(stem: Path, generation: int) -> Path:
