@@ -411,6 +411,16 @@ def test_a_checkpoint_that_does_not_fit_on_the_disk_is_told_in_words(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system gives no process a part of the cores")
+def test_processes_that_render_are_no_more_than_the_cores_that_training_was_given(monkeypatch):
+    """Four of a machine's 128, say: 127 processes, each with its meshes and appearances, do not fit in their memory."""
+    from ExpectedAppearancesLib.model import training
+
+    monkeypatch.setattr(os, "cpu_count", lambda: 128)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {7, 8, 9, 10})
+    assert training._feeder_workers(CPU) == 1 and training._feeder_workers(torch.device("cuda")) == 2
+
+
 def test_training_without_appearances_says_what_to_run(tmp_path):
     paths = write_inputs(tmp_path)
     bare = Case.create(tmp_path / "case", paths["vessels.vtp"], None, paths["camera.json"])

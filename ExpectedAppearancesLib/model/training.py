@@ -90,7 +90,7 @@ def train_case(
     folder = fold.folder if fold else case.model_folder
     trainer = _Trainer(case, preset, encoding, device, seed, views, folder)
     progress(0.0, "rendering validation views")
-    workers = max(1, (os.cpu_count() or 2) - 1)
+    workers = max(1, _cores() - 1)
     validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
     on_record = {"preset": preset.to_dict(), "seed": seed, "styles": trained_on, "held_out_styles": held_out}
     if fold is None:
@@ -115,9 +115,14 @@ def train_case(
     return figures
 
 
+def _cores() -> int:
+    """Those that this process may use: of a shared machine's many a batch system gives a few, and memory to match."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 2
+
+
 def _feeder_workers(device: torch.device) -> int:
     """Processes that render: on a CPU they share the cores with training, beside a GPU they have all but two."""
-    cores = os.cpu_count() or 2
+    cores = _cores()
     return max(1, cores - 2) if device.type == "cuda" else max(1, cores // 3)
 
 
@@ -179,7 +184,7 @@ class _Trainer:
         saved, interval_s = time.monotonic(), checkpoint_interval_s(0.0)
         if self.device.type == "cpu":
             # Rendering has cores of its own: threads that wait for each other on one core cost more than they give.
-            torch.set_num_threads(max(1, (os.cpu_count() or 2) - _feeder_workers(self.device)))
+            torch.set_num_threads(max(1, _cores() - _feeder_workers(self.device)))
         use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
