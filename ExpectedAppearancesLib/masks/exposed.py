@@ -33,10 +33,17 @@ def exposed_vessels(vessels: Mesh, parenchyma: Mesh, outward_axis: np.ndarray) -
 
 
 def _facing_outwards(vessels: Mesh, outward_axis: np.ndarray) -> Mesh:
-    """With all triangles turned where they face inwards, as a mirroring leaves them: the border on the far side of such
-    vessels would be taken for a part of the outline."""
+    """With the triangles of each piece turned where they face inwards, as a mirroring leaves them: the border on the
+    far side of such vessels would be taken for a part of the outline."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count, sides = len(vessels.vertices_mm), np.vstack([vessels.triangles[:, :2], vessels.triangles[:, 1:]])
+    joined = coo_matrix((np.ones(len(sides), bool), sides.T), (count, count))
+    pieces, piece_of_vertex = connected_components(joined, directed=False)
+    piece = piece_of_vertex[vessels.triangles[:, 0]]
     # The volume inside, seen from below: where the surface is open there, what lies below it counts as well.
     below_mm = vessels.centroid_mm - outward_axis * vessels.radius_mm
     a, b, c = (vessels.vertices_mm[vessels.triangles[:, i]] - below_mm for i in range(3))
-    volume = np.einsum("ij,ij->", a, np.cross(b, c))
-    return vessels if volume >= 0 else Mesh(vessels.vertices_mm, np.ascontiguousarray(vessels.triangles[:, ::-1]))
+    is_inwards = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)), pieces)[piece] < 0
+    return Mesh(vessels.vertices_mm, np.where(is_inwards[:, None], vessels.triangles[:, ::-1], vessels.triangles))
