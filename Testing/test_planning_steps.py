@@ -203,6 +203,25 @@ def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
         assert step.state is READY and words in step.text
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda recorded: recorded, "resume goes on from there"),
+        (lambda recorded: replace(recorded, appearances_sha256="b"), "the expected appearances; so it begins anew"),
+        (lambda recorded: with_stage(recorded, "render", craniotomy=MOVED), "the poses; so it begins anew"),
+        (lambda recorded: with_stage(recorded, "render", ranges=STEEPER["ranges"]), "the poses; so it begins anew"),
+    ],
+)
+def test_a_stopped_training_begins_anew_where_what_it_draws_was_made_again(change, words):
+    chosen, recorded = finished()
+    poses = {"ranges": RANGES, "craniotomy": CRANIOTOMY}
+    recorded = change(with_stage(replace(recorded, steps_trained=70), "train", done=False, poses=poses))
+    render = recorded.manifest["stages"]["render"]
+    chosen = replace(chosen, poses={key: render[key] for key in POSES})
+    step = plan_steps(chosen, recorded)["training"]
+    assert step.state is READY and words in step.text
+
+
 def test_a_stopped_study_begins_anew_with_other_settings_and_says_so(case):
     reader, folder = CaseReader(), str(case.folder)
     chosen = replace(finished()[0], preset="quick", minutes=26.0)

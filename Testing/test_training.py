@@ -263,6 +263,8 @@ def test_every_bad_frame_is_listed_and_nothing_is_written(trained, tmp_path, cap
 def test_training_is_on_record_with_seeds_styles_and_curve(trained):
     entry = json.loads((trained.folder / "case.json").read_text())["stages"]["train"]
     assert entry["done"] and entry["seed"] == 0 and entry["styles"] == ["a", "b"]
+    assert entry["appearances_sha256"] == files.sha256(store.folder_of(trained, "surface") / "index.json")
+    assert entry["poses"]["craniotomy"]["centre_world_mm"] == pytest.approx(trained.vessels.centroid_mm)
     assert entry["model_sha256"] == files.sha256(trained.model_folder / "model.onnx")
     curve = json.loads((trained.model_folder / "training.json").read_text())["curve"]
     assert [point["step"] for point in curve] == [2, 4] and all(p["validation_add_mm"] >= 0 for p in curve)

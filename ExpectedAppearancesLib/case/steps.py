@@ -16,6 +16,7 @@ STEPS = ("case", "microscope", "poses", "textures", "appearances", "training", "
 FEW_TEXTURES = 6  # fewer teach the network these textures rather than cortex
 LENGTH_TOLERANCE_MM = 0.05  # what is typed into a field is rounded to this
 ANGLE_TOLERANCE_DEG = 0.05
+POSES_DEPEND_ON = ("ranges", "craniotomy")  # of what `render` records: the poses that training draws
 RANGE_NAMES = {
     "tilt_max_deg": "the tilt",
     "roll_max_deg": "the roll",
@@ -282,6 +283,10 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
         if recorded.steps_trained:
             stopped = f"Stopped after step {recorded.steps_trained}"
             changed = changes_of_training(chosen.preset, chosen.minutes, train.get("preset", {}))
+            if train.get("appearances_sha256") not in (None, recorded.appearances_sha256):
+                changed.append("the expected appearances")
+            if train.get("poses") not in (None, {key: stages.get("render", {}).get(key) for key in POSES_DEPEND_ON}):
+                changed.append("the poses")
             if changed:
                 return Step(StepState.READY, f"{stopped}. Changed since: {_listed(changed)}; so it begins anew.")
             return Step(StepState.READY, f"{stopped}; resume goes on from there.")

@@ -20,6 +20,7 @@ from ..appearances.store import folder_of, read_appearances
 from ..cancelling import cancelling_waits
 from ..case.case import Case
 from ..case.meshes import write_vtp
+from ..case.steps import POSES_DEPEND_ON
 from ..devices import fast_dtype
 from ..evaluation.metrics import add_mm
 from ..masks.exposed import exposed_vessels
@@ -94,7 +95,10 @@ def train_case(
     validation = draw_views(case.folder, validation_views, preset.validation_views, workers)
     on_record = {"preset": preset.to_dict(), "seed": seed, "styles": trained_on, "held_out_styles": held_out}
     if fold is None:
-        case.record("train", **on_record, done=False)
+        # With others, a training that is stopped would begin anew: who shows it must know.
+        render = case.manifest["stages"].get("render", {})
+        of = {"appearances_sha256": trainer.appearances_sha256, "poses": {k: render.get(k) for k in POSES_DEPEND_ON}}
+        case.record("train", **on_record, **of, done=False)
     trainer.run(validation, progress)
     drawn = trainer.state["drawn"] * preset.fresh
     count = int(np.clip(drawn, *(times * preset.validation_views for times in (LEAST_CALIBRATION, CALIBRATION))))
@@ -109,7 +113,6 @@ def train_case(
             done=True,
             validation=figures,
             method=method,
-            appearances_sha256=trainer.appearances_sha256,
             model_sha256=model_sha256,
         )
     return figures
