@@ -317,6 +317,21 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     assert "SHA-256" in reader.recorded(folder, "surface", Limits()).problem
 
 
+def test_a_study_of_other_poses_is_outdated(case):
+    """Its verdict stood for a model that was trained since on a wider range, around another place."""
+    reader, folder = CaseReader(), str(case.folder)
+    case.record("render", ranges=RANGES, craniotomy=CRANIOTOMY)
+    for ranges, craniotomy, validation in (
+        (RANGES, CRANIOTOMY, "known"),
+        (STEEPER["ranges"], CRANIOTOMY, "stale"),
+        (RANGES, MOVED, "stale"),
+        (RANGES, None, "known"),  # of an older version, which did not say
+    ):
+        inputs = {"ranges": ranges, "craniotomy": craniotomy}
+        files.write_json(case.folder / "study" / "study.json", study() | {"inputs": inputs})
+        assert reader.recorded(folder, "surface", Limits()).validation == validation
+
+
 def test_a_case_whose_drive_is_gone_is_told_and_not_taken_for_one_to_be_saved(tmp_path):
     """A scene that was saved elsewhere: its models are there, its case is not."""
     recorded = CaseReader().recorded(str(tmp_path / "drive" / "case"), "surface", Limits())

@@ -15,7 +15,7 @@ from ..appearances.store import METHODS, newest_image
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
 from .case import MANIFEST_NAME, Case
-from .steps import Recorded, Study
+from .steps import POSES_DEPEND_ON, Recorded, Study
 
 STOPPED = ("cancelled", "failed")  # outcomes of a run as its record names them
 LARGEST_HEADER_BYTES = 1 << 24
@@ -69,7 +69,7 @@ class CaseReader:
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:
-        """Rows of the validation table, study first, and whether the study is about older appearances."""
+        """Rows of the validation table, study first, and whether the study is about older appearances or poses."""
         model = self._once(case.model_folder / "model.json", _read_object)
         rows: list[Figures] = []
         study = self._once(case.folder / "study" / "study.json", _read_object)
@@ -79,9 +79,12 @@ class CaseReader:
                 rows = figures_of_study(study)
             except InputError:
                 rows = []
-            used = (study.get("inputs") or {}).get("appearances_sha256")
+            inputs, render = study.get("inputs") or {}, case.manifest["stages"].get("render", {})
+            used = inputs.get("appearances_sha256")
             indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
-            stale = bool(rows and used) and used not in [index[1] for index in indices if index]
+            stale = bool(used) and used not in [index[1] for index in indices if index]
+            # Of another craniotomy, or of a narrower range, they say nothing of the model that was trained since.
+            stale = bool(rows) and (stale or any(inputs.get(k) not in (None, render.get(k)) for k in POSES_DEPEND_ON))
         if model:
             rows = rows + figures_of_model(model)
         return rows, stale
