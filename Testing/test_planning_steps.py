@@ -222,6 +222,18 @@ def test_a_stopped_training_begins_anew_where_what_it_draws_was_made_again(chang
     assert step.state is READY and words in step.text
 
 
+@pytest.mark.parametrize("changed", [{"roll_max_deg": 180.0}, {"lateral_offset_mm": 15.0}, {"in_view_min": 0.2}])
+def test_a_model_that_was_trained_on_narrower_views_is_outdated(changed):
+    """Also where they are narrower in what no pose is refused for."""
+    chosen, recorded = finished()
+    recorded = with_stage(recorded, "train", poses={"ranges": RANGES, "craniotomy": CRANIOTOMY})
+    assert plan_steps(chosen, recorded)["training"].state is DONE
+    wider = with_stage(recorded, "render", ranges=RANGES | changed, poses=50, seed=3)
+    chosen = replace(chosen, poses={key: wider.manifest["stages"]["render"][key] for key in POSES})
+    step = plan_steps(chosen, wider)["training"]
+    assert step.state is STALE and "the poses" in step.text
+
+
 def test_a_stopped_study_begins_anew_with_other_settings_and_says_so(case):
     reader, folder = CaseReader(), str(case.folder)
     chosen = replace(finished()[0], preset="quick", minutes=26.0)

@@ -294,7 +294,9 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     changed = []
     if _appearances_changed(stages, train, recorded.appearances_sha256):
         changed.append("the expected appearances")
-    if recorded.model and recorded.model.get("plausible_view") and _view_changed(recorded.model, stages.get("render")):
+    render = stages.get("render")
+    other_view = recorded.model and recorded.model.get("plausible_view") and _view_changed(recorded.model, render)
+    if other_view or _drawn_from_elsewhere(train, render):
         changed.append("the poses")
     trained = train.get("preset", {}).get("name", "")
     if chosen.preset and trained and chosen.preset != trained:
@@ -353,6 +355,15 @@ def _view_changed(model: dict, render: dict | None) -> bool:
         and _close(view["tilt_max_deg"], ranges["tilt_max_deg"], ANGLE_TOLERANCE_DEG)
         and _close(view["distance_mm"], ranges["working_distance_mm"], LENGTH_TOLERANCE_MM)
     )
+
+
+def _drawn_from_elsewhere(train: dict, render: dict | None) -> bool:
+    """Whether the poses of training, where it says which they were, are not those that `render` has recorded since."""
+    poses = train.get("poses") or {}
+    if not render or not all(poses.get(key) for key in POSES_DEPEND_ON):
+        return False
+    of_both = {"poses": None, "seed": None}  # label maps are drawn of their own ones
+    return bool(changes_of_poses(poses | of_both, render | of_both))
 
 
 def _close(first, second, tolerance: float) -> bool:
