@@ -29,7 +29,7 @@ PACKAGES = (
     (("torch",), "synthesize and train"),
     (("safetensors",), "synthesize and train"),
     (("onnx",), "train"),
-    (("scipy",), "demo"),
+    (("scipy",), "train, demo and tracking"),
     (("psutil",), "runs started from 3D Slicer"),
     (("filelock",), "runs started from 3D Slicer"),
     (("matplotlib",), "evaluate"),
