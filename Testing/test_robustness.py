@@ -102,7 +102,7 @@ def known_frames(folder, styles="ab", count=4) -> list[Frame]:
 
 
 class FocalPredictor:
-    """Off by a millimetre for each percent that the focal length is wrong; refuses above 4 %."""
+    """Off by a millimetre for each percent that the focal length is wrong; refuses above 4 %. Never quite sure."""
 
     def __init__(self, poses, style):
         self.poses, self.style = list(poses), style
@@ -112,7 +112,7 @@ class FocalPredictor:
         pose = self.poses.pop(0)
         self.poses.append(pose)
         moved = pose_from_rotation(np.eye(3), (0, percent, 0)) @ pose
-        return SimpleNamespace(camera_from_world=moved, accepted=percent < 4)
+        return SimpleNamespace(camera_from_world=moved, accepted=percent < 4, confidence=0.73)
 
 
 def test_table_against_hand_computation(tmp_path):
@@ -131,6 +131,10 @@ def test_table_against_hand_computation(tmp_path):
     assert {k: m["add_mm"]["mean"] for k, m in by_strength.items()} == pytest.approx(wanted)
     assert {k: m["refused"] for k, m in by_strength.items()} == {k: 8 * (v > 4) for k, v in wanted.items()}
     assert by_strength["+1 %"]["accepted_add_below_3mm"] == 1 and by_strength["+5 %"]["accepted_add_below_3mm"] is None
+    # Of all that have another image, and every pose of those is right; a wrong focal length no image shows.
+    disturbed = 8 * (len(table["rows"]) - len(wanted))
+    assert [(b["frames"], b["add_below_3mm"]) for b in table["reliability"]["bins"]] == [(disturbed, 1.0)]
+    assert table["reliability"]["expected_calibration_error"] == pytest.approx(0.27)
     kinds = {row["kind"] for row in table["rows"]}
     assert len(kinds) == 12 and {"brain shift", "JPEG", "exposure", "occlusion by sponge"} <= kinds
 

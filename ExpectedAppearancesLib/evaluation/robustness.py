@@ -13,7 +13,7 @@ from ..geometry.camera import Camera
 from ..geometry.pose import transform
 from ..registration.poses_file import Frame
 from ..registration.predictor import fitted_camera
-from .metrics import add_accuracy, frame_errors, summary
+from .metrics import FrameErrors, add_accuracy, frame_errors, reliability, summary
 from .overlays import sheet, with_caption
 from .perturbations import FrameState, Perturbation, perturbations
 
@@ -43,11 +43,12 @@ def robustness_table(
     progress: Callable[[float, str], None] = lambda _fraction, _message: None,
     rows: Sequence[Perturbation] | None = None,
 ) -> dict:
-    """{"model", "frames", "seed", "undisturbed": metrics, "rows": [{"kind", "strength", "metrics"}]}.
+    """{"model", "frames", "seed", "undisturbed": metrics, "rows": [{"kind", "strength", "metrics"}], "reliability"}.
 
     frames: with known poses; `count` of them are used. predictor_of(style): what registers frames of that style. model:
     says in words what that is. metrics: as one entry of metrics.json, and accepted_add_below_3mm, the share of accepted
-    frames with ADD < 3 mm (None where none is accepted).
+    frames with ADD < 3 mm (None where none is accepted). reliability: of all frames whose image is disturbed, which a
+    good model is sure of to all degrees; None where no image is.
     """
     chosen = choose(frames, count, seed)
     if not chosen:
@@ -55,7 +56,7 @@ def robustness_table(
     states = [_state(frame, camera, vertices_mm) for frame in chosen]
     wanted = [Perturbation("undisturbed", "", lambda state, _rng: (state.image, state.camera))]
     wanted += perturbations() if rows is None else rows
-    done = []
+    done, judged = [], []
     for k, perturbation in enumerate(wanted):
         predicted = []
         for i, (frame, state) in enumerate(zip(chosen, states)):
@@ -63,10 +64,14 @@ def robustness_table(
             rng = np.random.default_rng([seed, i, zlib.crc32(perturbation.kind.encode())])
             image, told = perturbation.apply(state, rng)
             predicted.append(predictor_of(frame.style).predict(image, told))
+            if image is not state.image:
+                judged.append((frame, predicted[-1]))
         done.append(_figures(vertices_mm, chosen, predicted))
         progress((k + 1) / len(wanted), f"robustness: {perturbation.kind} {perturbation.strength}".rstrip())
     table = [{"kind": p.kind, "strength": p.strength, "metrics": m} for p, m in zip(wanted[1:], done[1:])]
-    return {"model": model, "frames": len(chosen), "seed": seed, "undisturbed": done[0], "rows": table}
+    worth = reliability([p.confidence for _, p in judged], _errors(vertices_mm, *zip(*judged))) if judged else None
+    of_all = {"model": model, "frames": len(chosen), "seed": seed}
+    return of_all | {"undisturbed": done[0], "rows": table, "reliability": worth}
 
 
 def example_sheet(frame: Frame, camera: Camera, vertices_mm: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -89,11 +94,15 @@ def _state(frame: Frame, camera: Camera, vertices_mm: np.ndarray) -> FrameState:
 
 
 def _figures(vertices_mm: np.ndarray, frames: Sequence[Frame], predicted: Sequence) -> dict:
-    errors = frame_errors(
+    errors = _errors(vertices_mm, frames, predicted)
+    below = add_accuracy(errors.select(errors.accepted), GOOD_ADD_MM)
+    return summary(errors) | {"accepted_add_below_3mm": below}
+
+
+def _errors(vertices_mm: np.ndarray, frames: Sequence[Frame], predicted: Sequence) -> FrameErrors:
+    return frame_errors(
         vertices_mm,
         [frame.camera_from_world for frame in frames],
         [prediction.camera_from_world for prediction in predicted],
         [prediction.accepted for prediction in predicted],
     )
-    below = add_accuracy(errors.select(errors.accepted), GOOD_ADD_MM)
-    return summary(errors) | {"accepted_add_below_3mm": below}

@@ -95,7 +95,11 @@ def write_study_report(folder: Path, studies: Sequence[tuple[Path, dict]]) -> No
     }
     counted = {name: study["textures"] for name, (_, study) in zip(names, studies) if study.get("textures")}
     files.write_json(folder / "study.json", {name: study for name, (_, study) in zip(names, studies)})
-    pictures = _pictures(folder, entries, counted)
+    reliabilities = {label: e["all"]["reliability"] for label, (_, e) in entries.items() if "reliability" in e["all"]}
+    for name, (_, study) in zip(names, studies):
+        if (study.get("robustness") or {}).get("reliability"):
+            reliabilities[f"{name + ', ' if several else ''}disturbed frames"] = study["robustness"]["reliability"]
+    pictures = _pictures(folder, entries, counted, reliabilities)
     template = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
     html = template.render(
         cases=", ".join(names),
@@ -164,7 +168,7 @@ def robustness_rows(table: dict) -> list[list[str]]:
     return rows
 
 
-def _pictures(folder: Path, entries: dict, counted: dict) -> dict[str, str]:
+def _pictures(folder: Path, entries: dict, counted: dict, reliabilities: dict) -> dict[str, str]:
     pictures = dict.fromkeys(("curves", "bars", "reliability", "counts"), "")
     if entries:
         write_study_curves(folder / "curves.png", {label: entry["thresholds"] for label, (_, entry) in entries.items()})
@@ -172,7 +176,6 @@ def _pictures(folder: Path, entries: dict, counted: dict) -> dict[str, str]:
             folder / "textures.png", {label: entry["per_style"] for label, (_, entry) in entries.items()}
         )
         pictures |= {"curves": embedded(folder / "curves.png"), "bars": embedded(folder / "textures.png")}
-    reliabilities = {label: e["all"]["reliability"] for label, (_, e) in entries.items() if "reliability" in e["all"]}
     if reliabilities:
         write_reliability(folder / "reliability.png", reliabilities)
         pictures["reliability"] = embedded(folder / "reliability.png")
