@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ import pytest
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.demo.phantom import covered_frame, make_phantom
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.geometry.camera import write_camera
 from ExpectedAppearancesLib.live.choice import SourceKind
 from ExpectedAppearancesLib.live.estimator import open_model
+from ExpectedAppearancesLib.live.frames import FrameSettings
 from ExpectedAppearancesLib.live.trust import Sight
 from ExpectedAppearancesLib.registration.poses_file import write_poses
 
@@ -276,6 +279,23 @@ def test_steps_through_registered_frames_one_by_one(application, phantom, frames
         assert status.result.frame.name == f"{i}.png"
         assert status.verdict.sight is (Sight.REFUSED if i == 2 else Sight.FROZEN)
         np.testing.assert_allclose(status.result.prediction.camera_from_world, frames[0][i], atol=1e-9)
+    controller.close()
+
+
+def test_registered_frames_are_shown_as_they_were_registered(application, phantom, frames, tmp_path):
+    """What was set for a microscope before, its camera and that it sends the lowest row first, is not theirs."""
+    scene, _logic = application
+    files.write_png(tmp_path / "0.png", frames[1][0])
+    poses = [{"image": tmp_path / "0.png", "camera_from_world": frames[0][0]}]
+    write_poses(tmp_path / "poses.json", SMALL, poses)
+    write_camera(tmp_path / "camera.json", replace(SMALL, fx=1.1 * SMALL.fx, fy=1.1 * SMALL.fy))
+    of_another = {"camera_path": str(tmp_path / "camera.json"), "frames": FrameSettings(flip_rows=True)}
+    controller = LiveController(scene)
+    choice = choice_of(phantom, kind=SourceKind.PATH, path=str(tmp_path / "poses.json"), **of_another)
+    controller.start(choice)
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FROZEN
+    np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][0])
+    assert controller.camera.matrix == pytest.approx(SMALL.matrix)
     controller.close()
 
 

@@ -375,7 +375,7 @@ class LiveController:
         estimator = loaded.model.estimator if loaded.model else None
         source = loaded.source
         self._session = LiveSession(
-            self.case, estimator, source.camera, choice.frames, choice.stale_s, self._clock, self._overlays
+            self.case, estimator, source.camera, choice.frame_settings, choice.stale_s, self._clock, self._overlays
         )
         self._session.steady = choice.steady
         self._session.start(source.source, single or source.still)
