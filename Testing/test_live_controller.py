@@ -16,6 +16,7 @@ from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import write_camera
 from ExpectedAppearancesLib.live.choice import SourceKind
 from ExpectedAppearancesLib.live.estimator import open_model
+from ExpectedAppearancesLib.live.feed import FeedState
 from ExpectedAppearancesLib.live.frames import FrameSettings
 from ExpectedAppearancesLib.live.trust import Sight
 from ExpectedAppearancesLib.registration.poses_file import write_poses
@@ -154,6 +155,51 @@ def test_the_picture_that_is_shown_is_no_source(application, phantom, model, fra
         controller.start(choice_of(phantom, node_name=own), model=model)
     assert not controller.running
     controller.close()
+
+
+def test_a_stream_that_returns_is_told_from_a_view_of_its_name_and_from_the_panels_own_picture(application, frames):
+    """The layout's slice is called Microscope, as many a stream is."""
+    scene, _logic = application
+    for class_name, own in (("vtkMRMLSliceNode", False), ("vtkMRMLVectorVolumeNode", True)):
+        same_name = scene.AddNewNodeByClass(class_name, "Stream")
+        if own:
+            same_name.SetAttribute("ExpectedAppearances.Live", "frame")
+            send(same_name, frames[1][7])
+    stream = node_with(scene, frames[1][0])
+    came = []
+    source = NodeFrames(scene, stream, came.append)
+    scene.RemoveNode(stream)
+    assert source.look().state is FeedState.LOST
+    node_with(scene, frames[1][1])
+    assert source.look().state is FeedState.RUNNING
+    assert [np.array_equal(came[-1].image_rgb, frames[1][i]) for i in (1, 7)] == [True, False]
+    source.close()
+
+
+def test_pictures_that_cannot_be_decoded_are_no_new_frames(application, frames):
+    """The node's image is then still the one before, and counts as changed: it would never get too old."""
+    scene, _logic = application
+    encoder = scene.AddNewNodeByClass("vtkMRMLStreamingVolumeNode", "Encoder")
+    encoder.SetCodecFourCC("RV24")
+
+    def compressed(image):
+        send(encoder, image)
+        assert encoder.EncodeImageData(True)
+        return encoder.GetFrame()
+
+    stream = scene.AddNewNodeByClass("vtkMRMLStreamingVolumeNode", "Stream")
+    came = []
+    source = NodeFrames(scene, stream, came.append)
+    stream.SetAndObserveFrame(compressed(frames[1][0]))
+    assert len(came) == 1 and not source.look().problem
+    unknown = compressed(frames[1][1])
+    unknown.SetCodecFourCC("????")
+    stream.SetAndObserveFrame(unknown)
+    assert len(came) == 1 and "cannot be decoded" in source.look().problem
+    stream.SetAndObserveFrame(compressed(frames[1][2]))
+    assert len(came) == 2 and not source.look().problem
+    np.testing.assert_array_equal(came[1].image_rgb, frames[1][2])
+    source.close()
 
 
 @pytest.mark.parametrize("removed", ["frame", "Vessels", "outline"])

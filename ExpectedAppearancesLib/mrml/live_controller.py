@@ -31,7 +31,7 @@ from .live_align import Alignment, pose_of_landmarks
 from .live_drawing import at_once
 from .live_nodes import ROLE_ATTRIBUTE, node_of_role, remove_live_nodes
 from .live_scene import FRAME, LiveScene, OverlayOptions
-from .live_stream import NodeFrames
+from .live_stream import NodeFrames, find_volume
 
 
 class Views(Protocol):
@@ -405,8 +405,8 @@ class LiveController:
         self.status = self._status(update)
 
     def _node(self, choice: Choice):
-        node = self._scene.GetNodeByID(choice.node_name) or self._scene.GetFirstNodeByName(choice.node_name)
-        if node is None or not node.IsA("vtkMRMLVolumeNode"):
+        node = find_volume(self._scene, choice.node_name)
+        if node is None:
             raise InputError(f"{choice.node_name}: there is no such volume in the scene; choose it again.")
         if node is node_of_role(self._scene, FRAME) or node.GetAttribute(ROLE_ATTRIBUTE):
             raise InputError(

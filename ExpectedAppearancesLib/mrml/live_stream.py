@@ -9,6 +9,7 @@ import numpy as np
 
 from ..live.feed import FeedState, FeedStatus
 from ..live.frames import LiveFrame
+from .live_nodes import ROLE_ATTRIBUTE
 
 NODE_CLASSES = ("vtkMRMLVectorVolumeNode", "vtkMRMLStreamingVolumeNode", "vtkMRMLScalarVolumeNode")
 
@@ -41,8 +42,8 @@ class NodeFrames:
         if self._node is not None and not self._scene.IsNodePresent(self._node):
             self._detach()
         if self._node is None:
-            node = self._scene.GetNodeByID(self._id) or self._scene.GetFirstNodeByName(self._name)
-            if node is not None and node.IsA("vtkMRMLVolumeNode"):
+            node = find_volume(self._scene, self._id) or find_volume(self._scene, self._name)
+            if node is not None:
                 self._attach(node)
         return self.status
 
@@ -65,8 +66,11 @@ class NodeFrames:
         self._node = self._tags = self._stamp = None
 
     def _on_image(self, _caller=None, _event=None) -> None:
-        if hasattr(self._node, "DecodeFrame"):
-            self._node.DecodeFrame()
+        compressed = hasattr(self._node, "GetFrame") and self._node.GetFrame() is not None
+        if compressed and not self._node.DecodeFrame():
+            # The node's image is the one before, or nothing, and yet it counts as changed.
+            self._problem = f"The pictures of {self._name} cannot be decoded; check the codec, or send them raw."
+            return
         data = self._node.GetImageData()
         if data is None:
             return
@@ -80,6 +84,20 @@ class NodeFrames:
         if image is not None:
             self._number += 1
             self._deliver(LiveFrame(image, self._clock(), self._number - 1, f"{self._name} {self._number - 1}"))
+
+
+def find_volume(scene, id_or_name: str):
+    """The volume of that id, else the first of that name that is not the panel's own; None where there is none.
+
+    Views and connectors may have the same name.
+    """
+    node = scene.GetNodeByID(id_or_name)
+    if node is not None and node.IsA("vtkMRMLVolumeNode"):
+        return node
+    found = scene.GetNodesByClassByName("vtkMRMLVolumeNode", id_or_name)
+    found.UnRegister(None)
+    named = [found.GetItemAsObject(i) for i in range(found.GetNumberOfItems())]
+    return next((node for node in named if not node.GetAttribute(ROLE_ATTRIBUTE)), None)
 
 
 def pixels_of(image_data) -> np.ndarray | None:
