@@ -144,6 +144,21 @@ def test_the_filled_vessels_are_a_layer_only_while_they_are_seen(case, watched):
     assert ours.composite.GetLabelVolumeID() is None
 
 
+def test_the_mri_is_cut_along_the_optical_axis_only_while_the_pose_holds(case, application):
+    """No words stand over that view: what is seen in it must be of this frame."""
+    scene, logic = application
+    ours, mri = SliceView(scene, logic, "Microscope", SIZE), SliceView(scene, logic, "MicroscopeMRI", SIZE)
+    live, views = LiveScene(scene, case), LiveViews(ours.logic, lambda: None, lambda: mri.node)
+    for accepted in (True, False, True):
+        live.show(result_of(case, accepted))
+        views.follow(live, False)
+        to_slice = np.linalg.inv(vtk_matrix_values(mri.node.GetSliceToRAS()))
+        axis = live.camera_to_world @ np.array([(0, 0, 0, 1), (0, 0, live.plane_mm, 1)]).T
+        off_mm = np.abs((to_slice @ axis)[2])
+        assert (off_mm < 1e-6).all() if accepted else (off_mm > 10_000).all()
+        assert mri.node.GetSliceVisible() == accepted
+
+
 def test_lines_that_were_not_wanted_are_those_of_the_frame_when_they_are(case, watched):
     """They are not worked out while they are hidden, so they must be when they are shown."""
     live, _views, _ours, _layers = watched

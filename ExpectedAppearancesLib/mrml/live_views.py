@@ -91,12 +91,9 @@ class LiveViews:
         visible = live.overlay_visible
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
-        depth = self._depth_node() if visible else None
+        depth = self._depth_node()
         if depth is not None:
-            align_depth_slice(depth, camera_to_world, live.plane_mm)
-            if changed or self._depth_fitted is not depth:
-                self._depth_fitted = depth
-                fit_slice(depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
+            self._follow_in_depth(depth, live, camera_to_world, changed)
         through = self._through_view()
         if through is not None:
             view_node, camera_node, view_size_px = through
@@ -105,6 +102,18 @@ class LiveViews:
                 aim_camera(camera_node, view_size_px, live.camera, camera_to_world, live.plane_mm)
             else:
                 look_away(camera_node)
+
+    def _follow_in_depth(self, depth, live: LiveScene, camera_to_world: np.ndarray, changed: bool) -> None:
+        visible = live.overlay_visible
+        if bool(depth.GetSliceVisible()) != visible:
+            depth.SetSliceVisible(visible)
+        if not visible:
+            put_slice_away(depth)
+            return
+        align_depth_slice(depth, camera_to_world, live.plane_mm)
+        if changed or self._depth_fitted is not depth:
+            self._depth_fitted = depth
+            fit_slice(depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
 
     def let_go(self) -> None:
         """The view samples as Slicer does by itself; the layers stay."""
@@ -269,6 +278,13 @@ def look_away(camera_node) -> None:
     camera_node.SetFocalPoint(x, y, z + 1e5)
     camera_node.SetPosition(x, y, z + 1e5 - 1)
     camera_node.SetViewUp(0, 1, 0)
+
+
+def put_slice_away(slice_node) -> None:
+    """Off the patient: what it cut belonged to a pose that does not hold any more."""
+    away = np.eye(4)
+    away[2, 3] = 1e5
+    _set_slice_to_ras(slice_node, away)
 
 
 def _set_slice_to_ras(slice_node, matrix: np.ndarray) -> None:

@@ -84,11 +84,13 @@ class LayoutSection:
             view.resetFocalPoint()
             view.resetCamera()
 
-    def show_mri(self, volume) -> None:
-        """Put a volume into the depth view, and that view into 3D; without a volume there is no such view."""
+    def show_mri(self, volume) -> bool:
+        """Put a volume into the depth view; without one there is no such view. True when that view has come: the views
+        have to follow the frame again, and it with them."""
         manager = slicer.app.layoutManager()
         if manager is None:
-            return
+            return False
+        has_come = volume is not None and not self._with_mri
         self._with_mri = volume is not None
         layout_node = manager.layoutLogic().GetLayoutNode()
         wanted = live_views.add_layout(layout_node, self._with_mri)
@@ -96,13 +98,15 @@ class LayoutSection:
             layout_node.SetViewArrangement(wanted)
         widget = manager.sliceWidget(live_views.MRI)
         if widget is None:
-            return
+            return False
         composite = widget.sliceLogic().GetSliceCompositeNode()
         composite.SetBackgroundVolumeID(volume.GetID() if volume is not None else None)
         composite.SetForegroundVolumeID(None)
         composite.SetLabelVolumeID(None)
-        widget.mrmlSliceNode().SetSliceVisible(volume is not None)
+        if volume is None:
+            widget.mrmlSliceNode().SetSliceVisible(False)
         self._restrict_slice(widget.mrmlSliceNode())
+        return has_come
 
     @staticmethod
     def _layout_ids(layout_node) -> set[int]:

@@ -130,8 +130,8 @@ class LivePanel:
         options = OverlayOptions(p.outline, p.fill, p.fillOpacity, p.box)
         if options != self.controller.options:
             self.controller.set_options(options)
-        if self.layout.active:
-            self.layout.show_mri(p.mriVolume)
+        if self.layout.active and self.layout.show_mri(p.mriVolume):
+            self.fit()
         self._show_problem()
 
     def say(self, text: str, done: bool = False) -> None:
