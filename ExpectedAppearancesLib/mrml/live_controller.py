@@ -30,7 +30,7 @@ from . import live_record
 from .live_align import Alignment, pose_of_landmarks
 from .live_drawing import at_once
 from .live_nodes import ROLE_ATTRIBUTE, node_of_role, remove_live_nodes
-from .live_scene import FRAME, LiveScene, OverlayOptions
+from .live_scene import FRAME, PLANE_CHANGE, LiveScene, OverlayOptions
 from .live_stream import NodeFrames, find_volume
 
 
@@ -237,11 +237,12 @@ class LiveController:
             start = result.prediction.camera_from_world
         if start is None:
             start = self._view_from_above(result.camera)
-        overlay = self._overlays.make(self.live.camera, start)
+        overlay, plane_mm = self._overlays.make(self.live.camera, start), self.live.plane_mm
         if overlay is not None:
             self.live.put_plane_at(overlay.depth_mm)
         self.alignment = Alignment(self.live, self.case, start)
         self.show_truth(start)
+        self._follow(abs(self.live.plane_mm / plane_mm - 1) > PLANE_CHANGE)
         return self.alignment
 
     @at_once
@@ -274,6 +275,7 @@ class LiveController:
         result = self.result
         if result is not None and result.accepted and self.live is not None:
             self.live.set_pose(result.camera_from_world)  # what was predicted is what the views follow
+        self._follow(False)
 
     @at_once
     def show_truth(self, camera_from_world: np.ndarray | None) -> None:

@@ -88,7 +88,7 @@ class LiveViews:
         live.show_lines_in(self._line_view_ids)
         show_layers(self._composite, live.frame, live.fill, live.fill_opacity)
         self._intensity.skip()
-        visible = live.overlay_visible
+        visible = live.vessels_visible
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
         depth = self._depth_node()
