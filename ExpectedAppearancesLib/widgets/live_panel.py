@@ -106,6 +106,7 @@ class LivePanel:
         if self._parameter_node is not None:
             self._parameter_node.disconnectGui(self._gui_tag)
         self._parameter_node = parameter_node
+        self._camera = None  # that of a new scene is not known yet
         if parameter_node is not None:
             self._gui_tag = parameter_node.connectGui(self.ui)
             self.refresh()
