@@ -15,6 +15,7 @@ from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.live import sources
 from ExpectedAppearancesLib.live.choice import Choice, SourceKind, open_source, problems_of
 from ExpectedAppearancesLib.live.feed import Feed, FeedState
+from ExpectedAppearancesLib.registration.footage import VIDEO_SUFFIXES
 from ExpectedAppearancesLib.registration.poses_file import write_poses
 
 
@@ -322,6 +323,11 @@ def test_choice_lists_all_that_is_missing_and_opens_what_is_there(tmp_path, vide
     assert "Choose the volume" in problems_of(Choice(kind=SourceKind.NODE))[-1]
     assert isinstance(open_source(Choice(path=str(tmp_path))).source, sources.ImageFiles)
     assert isinstance(open_source(Choice(path=str(video))).source, sources.VideoFile)
+    for suffix in VIDEO_SUFFIXES:  # all that `register` takes, as the .mts of many recorders
+        path = tmp_path / f"video{suffix}"
+        path.write_bytes(b"")
+        assert isinstance(open_source(Choice(path=str(path))).source, sources.VideoFile)
+        assert "not a kind of file" not in problems_of(Choice(path=str(path)))[-1]
     write_images(tmp_path, ["1.png"])
     assert open_source(Choice(path=str(tmp_path / "1.png"))).still
     with pytest.raises(InputError, match=r"a\.txt"):

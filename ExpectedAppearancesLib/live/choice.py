@@ -9,9 +9,10 @@ from pathlib import Path
 from ..case.case import MANIFEST_NAME
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera, read_camera
+from ..registration.footage import VIDEO_SUFFIXES
 from .estimator import given_poses, poses_of_video
 from .frames import FrameSettings
-from .sources import IMAGE_SUFFIXES, USUAL_RATE_HZ, VIDEO_SUFFIXES, CaptureDevice, ImageFiles, Source, VideoFile
+from .sources import IMAGE_SUFFIXES, USUAL_RATE_HZ, CaptureDevice, ImageFiles, Source, VideoFile
 
 
 class SourceKind(Enum):

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ..registration.predictor import Prediction
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".mpg", ".mpeg", ".wmv", ".m4v")
 DAMAGED_AFTER_S = 2.0  # a file that has not grown for so long and is still not whole never will be
 USUAL_RATE_HZ = 25.0
 
