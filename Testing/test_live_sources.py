@@ -78,6 +78,36 @@ def test_a_file_is_taken_only_when_it_is_whole(tmp_path, suffix):
         np.testing.assert_array_equal(found.image_rgb, image)
 
 
+@pytest.mark.parametrize("only_new", [False, True])
+def test_a_folder_of_thousands_is_not_sorted_for_each_image(tmp_path, monkeypatch, only_new):
+    """Looking for the next image took longer than to register one, again and again while none came."""
+    data = cv2.imencode(".png", noise(40, 32))[1].tobytes()
+    for i in range(50):
+        (tmp_path / f"{i}.png").write_bytes(data)
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, only_new=only_new)
+    source.open()
+    looked_at = []
+    in_order = sources._natural_order
+    monkeypatch.setattr(sources, "_natural_order", lambda path: looked_at.append(path) or in_order(path))
+    if only_new:
+        (tmp_path / "50.png").write_bytes(data)
+    names = ["50.png"] if only_new else [f"{i}.png" for i in range(50)]
+    assert [frame.name for frame in read_all(source, len(names))] == names
+    assert read_all(source, 1, 0.05) == [] and len(looked_at) == len(names)
+
+
+def test_an_image_that_is_taken_away_before_its_turn_does_not_hold_up_the_others(tmp_path):
+    write_images(tmp_path, ["1.png", "2.png", "3.png"])
+    now = [0.0]
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, clock=lambda: now[0])
+    source.open()
+    assert source.read().name == "1.png"
+    (tmp_path / "2.png").unlink()
+    now[0] += 0.01
+    assert source.read() is None
+    assert source.read().name == "3.png"
+
+
 def test_a_file_that_never_gets_whole_is_said_and_left_out(tmp_path):
     write_images(tmp_path, ["b.png"])
     (tmp_path / "a.png").write_bytes((tmp_path / "b.png").read_bytes()[:200])
