@@ -39,6 +39,8 @@ class Views(Protocol):
 
     def follow(self, live: LiveScene, changed: bool) -> None: ...
 
+    def was_moved(self) -> bool: ...
+
 
 class LiveController:
     """Owns the session, its nodes in `scene`, the recording and the alignment. `close` leaves nothing behind.
@@ -433,9 +435,10 @@ class LiveController:
             self.views.follow(self.live, changed)
 
     def _follow_models(self) -> None:
-        """The user may move the models, and camera and frame with them, while no new frame comes."""
+        """While no new frame comes the user may move the models, camera and frame with them, or the view."""
         self.live.follow_models()
-        if self.views is not None and not np.array_equal(self.live.camera_to_world, self._seen_from):
+        views = self.views
+        if views and (views.was_moved() or not np.array_equal(self.live.camera_to_world, self._seen_from)):
             self._follow(False)
 
     def _forget_truth(self) -> None:

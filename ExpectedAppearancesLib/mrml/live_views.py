@@ -74,6 +74,7 @@ class LiveViews:
         self._line_view_ids = line_view_ids
         self._fitted: tuple | None = None
         self._depth_fitted = None
+        self._aimed: tuple | None = None  # the camera node that looks through the microscope's, and from where
 
     def follow(self, live: LiveScene, changed: bool) -> None:
         """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
@@ -102,6 +103,12 @@ class LiveViews:
                 aim_camera(camera_node, view_size_px, live.camera, camera_to_world, live.plane_mm)
             else:
                 look_away(camera_node)
+            self._aimed = (camera_node, _place_of(camera_node)) if visible else None
+
+    def was_moved(self) -> bool:
+        """Whether the user turned or zoomed the view through the camera: from elsewhere the vessels lie on other parts
+        of the picture behind them."""
+        return self._aimed is not None and self._aimed[1] != _place_of(self._aimed[0])
 
     def _follow_in_depth(self, depth, live: LiveScene, camera_to_world: np.ndarray, changed: bool) -> None:
         visible = live.overlay_visible
@@ -122,6 +129,7 @@ class LiveViews:
     def leave(self) -> None:
         """Nothing of the live frame stays in the views."""
         self.let_go()
+        self._aimed = None
         self._slice.SetSliceVisible(False)
         for put in (self._composite.SetBackgroundVolumeID, self._composite.SetLabelVolumeID):
             put(None)
@@ -270,6 +278,10 @@ def aim_camera(camera_node, view_size_px: tuple[int, int], camera: Camera, camer
     )
     camera_node.EndModify(was_modifying)
     camera_node.ResetClippingRange()
+
+
+def _place_of(camera_node) -> tuple:
+    return camera_node.GetPosition(), camera_node.GetParallelProjection()
 
 
 def look_away(camera_node) -> None:
