@@ -182,6 +182,31 @@ def test_a_recording_of_another_case_shows_no_overlay(application, phantom, mode
     controller.close()
 
 
+@pytest.mark.parametrize("damaged", ["note", "case", "no case"])
+def test_no_overlay_stays_where_a_recording_cannot_be_looked_at_any_more(application, phantom, model, frames, damaged):
+    """Slicer plays its frames all the same, and they would have the overlay of the last one that could be."""
+    scene, logic = application
+    controller = LiveController(scene)
+    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+    browser.SetSelectedItemNumber(0)
+    case = str(phantom.case.folder)
+    assert controller.look_at(browser, case).verdict.shows_overlay
+    browser.SetSelectedItemNumber(1)
+    logic.sequences.UpdateProxyNodesFromSequences(browser)
+    if damaged == "no case":
+        assert controller.look_at(browser, "").verdict.sight is Sight.IDLE
+    else:
+        note = live_record._sequence(browser, "note").GetNthDataNode(1)
+        whole = note.GetText()
+        note.SetText("{}" if damaged == "note" else whole)
+        with pytest.raises(InputError):
+            controller.look_at(browser, str(phantom.case.folder.parent) if damaged == "case" else case)
+        note.SetText(whole)
+    assert not controller.live.overlay_visible and controller.tick().verdict.sight is Sight.IDLE
+    assert controller.look_at(browser, case).verdict.shows_overlay and controller.live.overlay_visible
+    controller.close()
+
+
 def test_export_gives_poses_images_and_transforms(application, phantom, model, frames, tmp_path):
     scene, _logic = application
     controller = LiveController(scene)

@@ -314,6 +314,24 @@ class LiveController:
         recorder, self.recorder = self.recorder, None
         return recorder.finish() if recorder is not None else None
 
+    def look_at(self, browser, case_path: str) -> Status:
+        """`replay`, with the vessels of that case. Without one ('') and where it raises InputError no overlay is left:
+        Slicer goes on to play frames, and that before was not theirs."""
+        try:
+            if case_path:
+                self.open_case(case_path)
+                return self.replay(browser)
+        except InputError:
+            self._look_away()
+            raise
+        self._look_away()
+        return self.status
+
+    def _look_away(self) -> None:
+        self._replayed = None
+        if self.result is not None:
+            self.stop()
+
     @at_once
     def replay(self, browser) -> Status:
         """Draw the overlay of the recorded frame that `browser` is at; call it whenever it may have moved."""
