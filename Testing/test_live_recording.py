@@ -207,6 +207,23 @@ def test_no_overlay_stays_where_a_recording_cannot_be_looked_at_any_more(applica
     controller.close()
 
 
+@pytest.mark.parametrize("removed", ["frame", "transform"])
+def test_a_recording_is_seen_again_although_the_user_removed_what_it_plays_into(
+    application, phantom, model, frames, removed
+):
+    """Slicer makes such a node anew, under no transform."""
+    scene, _logic = application
+    controller = LiveController(scene)
+    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+    case = str(phantom.case.folder)
+    controller.look_at(browser, case)
+    scene.RemoveNode(getattr(controller.live, removed))
+    assert controller.look_at(browser, case).verdict.shows_overlay
+    np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][1])
+    assert controller.live.frame.GetParentTransformNode() is controller.live.transform
+    controller.close()
+
+
 def test_export_gives_poses_images_and_transforms(application, phantom, model, frames, tmp_path):
     scene, _logic = application
     controller = LiveController(scene)

@@ -126,6 +126,7 @@ class LiveScene:
         from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
         self.follow_models()
+        self.frame.SetAndObserveTransformNodeID(self.transform.GetID())  # one that the user removed is made anew
         matrix = vtkMatrix4x4()
         self.frame.GetIJKToRASMatrix(matrix)
         self._stamp = self._newest_change()
