@@ -34,6 +34,7 @@ class Alignment:
         display = self.handles.GetDisplayNode()
         if display is not None:
             display.SetAttribute(ROLE_ATTRIBUTE, HANDLES)
+            display.SetSaveWithScene(False)
             display.SetEditorVisibility(True)
             display.SetEditorSliceIntersectionVisibility(False)
             display.SetEditorScalingEnabled(False)

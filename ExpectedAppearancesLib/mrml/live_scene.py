@@ -244,7 +244,8 @@ class LiveScene:
         if self.frustum is None:
             self.frustum = mark(scenes.add_frustum(self._scene, camera, plane_mm, self.transform), FRUSTUM)
             self.frustum.SetSelectable(False)
-            self.frustum.SetSaveWithScene(False)
+            for node in (self.frustum, self.frustum.GetDisplayNode()):
+                node.SetSaveWithScene(False)
         else:
             scenes.set_frustum(self.frustum, camera, plane_mm)
         return True
