@@ -107,8 +107,11 @@ def test_overlay_goes_when_frames_stop_and_returns_with_them(application, phanto
     now = [100.0]
     controller = LiveController(scene, clock=lambda: now[0])
     controller.start(choice_of(phantom, stale_s=0.5), model=model)
-    wait_for(controller, lambda s: s.new)
-    assert controller.status.verdict.sight is Sight.FOLLOWING
+    # What the stream held at the start may be of a stream that stopped yesterday.
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.STALE
+    assert not controller.live.overlay_visible and controller.status.latency_ms is None
+    send(stream, images[1])
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     now[0] += 0.6
     assert controller.tick().verdict.sight is Sight.STALE
     assert not controller.live.overlay_visible
@@ -205,7 +208,7 @@ def test_pictures_that_cannot_be_decoded_are_no_new_frames(application, frames):
 @pytest.mark.parametrize("removed", ["frame", "Vessels", "outline"])
 def test_nodes_that_the_user_removed_are_there_again_after_a_start(application, phantom, model, frames, removed):
     scene, _logic = application
-    node_with(scene, frames[1][0])
+    stream = node_with(scene, frames[1][0])
     controller = LiveController(scene)
     controller.start(choice_of(phantom, stale_s=60), model=model)
     wait_for(controller, lambda s: s.new)
@@ -213,6 +216,8 @@ def test_nodes_that_the_user_removed_are_there_again_after_a_start(application, 
     live = controller.live
     scene.RemoveNode(live.frame if removed == "frame" else (live.models | live.lines)[removed])
     controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, frames[1][1])
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     live = controller.live
     assert all(scene.IsNodePresent(n) for n in (live.frame, *live.models.values(), *live.lines.values()))
@@ -358,11 +363,13 @@ def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(app
     assert controller.tick().verdict.sight is Sight.IDLE
     assert no_thread_is_left()
     after_close = scene.GetNumberOfNodes()
-    node_with(scene, frames[1][2])
+    stream = node_with(scene, frames[1][2])
     controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, frames[1][3])
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     controller.close()
-    scene.RemoveNode(scene.GetFirstNodeByName("Stream"))
+    scene.RemoveNode(stream)
     assert scene.GetNumberOfNodes() == after_close
 
 

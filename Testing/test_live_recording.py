@@ -315,6 +315,8 @@ def test_a_steadied_session_draws_and_records_the_filtered_pose(application, pha
     stream = node_with(scene, images[0])
     controller = LiveController(scene, clock=lambda: now[0])
     controller.start(choice_of(phantom, stale_s=60, steady=True), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, images[0])
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.VIEW_LOST  # one frame is no motion yet
     controller.start_recording()
     drawn = []

@@ -5,6 +5,7 @@ All is saved with the scene by Slicer itself. Replaying puts a frame, its transf
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -54,10 +55,11 @@ class Recorder:
         return self.mb >= self._limit_mb
 
     def add(self, result: LiveResult) -> bool:
-        """Append a result that is shown in the live scene. False when it has no picture, or the limit is reached."""
+        """Append a result that is shown in the live scene. False when it has no picture or time, or the limit is
+        reached."""
         from ..registration.predictor import Prediction
 
-        if result.image_rgb is None or self.full:
+        if result.image_rgb is None or not math.isfinite(result.frame.taken_s) or self.full:
             return False
         if self._begin_s is None:
             self._begin_s = result.frame.taken_s
