@@ -96,6 +96,34 @@ def test_a_folder_of_thousands_is_not_sorted_for_each_image(tmp_path, monkeypatc
     assert read_all(source, 1, 0.05) == [] and len(looked_at) == len(names)
 
 
+@pytest.mark.parametrize("suffix", [".png", ".bmp"])
+def test_a_folder_that_is_filled_faster_than_it_is_shown_stays_in_the_present(tmp_path, suffix):
+    """Shown one by one, the pictures were ever older, and as new as if they had just been taken; so after a pause."""
+    data = cv2.imencode(suffix, noise(40, 32))[1].tobytes()
+    now, shown, written = [0.0], [], 0
+
+    def write_up_to(number):
+        nonlocal written
+        while written < number:
+            written += 1
+            (tmp_path / f"{written}{suffix}").write_bytes(data)
+
+    write_up_to(5)
+    source = sources.ImageFiles(tmp_path, rate_hz=10, clock=lambda: now[0])
+    source.open()
+    for step in range(200):
+        now[0] += 0.05
+        if step >= 50:
+            write_up_to(5 + 2 * (step - 49))  # 40 a second
+        frame = source.read()
+        if frame is not None:
+            shown.append(int(frame.name.split(".")[0]))
+            assert shown[-1] <= 5 or written - shown[-1] < 25
+    assert shown[:5] == [1, 2, 3, 4, 5]  # those that were there
+    assert shown == sorted(shown) and len(shown) > 20
+    assert source.dropped + len(shown) > written - 25
+
+
 def test_an_image_that_is_taken_away_before_its_turn_does_not_hold_up_the_others(tmp_path):
     write_images(tmp_path, ["1.png", "2.png", "3.png"])
     now = [0.0]

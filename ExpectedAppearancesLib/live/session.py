@@ -155,7 +155,8 @@ class LiveSession:
         self._hold_source(False)
 
     def next_frame(self) -> None:
-        """Register one more frame, then hold again; of files and videos it is the very next one."""
+        """Register one more frame, then hold again; of files and videos it is the very next one, unless they came
+        only now."""
         self._frozen, self._single = False, True
         self._hold_source(False)
 

@@ -54,8 +54,9 @@ class Source(Protocol):
 class ImageFiles:
     """The images of a list or folder, in the order of the numbers in their names, `rate_hz` of them a second.
 
-    A folder is watched: images that come later follow, as soon as they are whole. only_new leaves out those that were
-    there at the start. given: pose of each image (by path) that was registered before.
+    A folder is watched: images that come later follow, as soon as they are whole; of many that came meanwhile, as
+    during a pause, only the last two, so that what is shown is the present. only_new leaves out those that were there
+    at the start. given: pose of each image (by path) that was registered before.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class ImageFiles:
         self._number = 0
         self._seen: set[str] | None = None
         self._next: list[Path] = []  # found and not shown yet, the last one first
+        self._were_there = True  # those of the next look: then all are shown
         self._unfinished: dict[Path, tuple[tuple, float]] = {}
 
     def open(self) -> None:
@@ -93,7 +95,8 @@ class ImageFiles:
         if self._clock() < self._due_s:
             return None
         begin_s = self._clock()
-        self._next = self._next or self._unseen()[::-1]
+        if not self._next:
+            self._next = self._found()
         if self._next:
             path = self._next.pop()
             data = self._whole_file(path)
@@ -103,9 +106,12 @@ class ImageFiles:
                 self._number += 1
                 image = _decoded(data, path)
                 return LiveFrame(image, self._clock(), self._number - 1, path.name, self._given.get(path))
-            self._next = []  # in order: those after it wait, unless it is taken away
+            if path.exists():
+                self._next.append(path)  # in order: those after it wait
+            else:
+                self._next, self._were_there = [], True
         elif self._repeat:
-            self._seen = set(self._left_out)
+            self._seen, self._were_there = set(self._left_out), True
         elif not self._folder:
             raise SourceEnded("the last image was shown.")
         self._due_s = self._clock() + REST * (self._clock() - begin_s)
@@ -115,7 +121,15 @@ class ImageFiles:
         self._due_s = self._clock()
 
     def close(self) -> None:
-        self._unfinished, self._next = {}, []
+        self._unfinished = {}
+
+    def _found(self) -> list[Path]:
+        found = self._unseen()
+        late = [] if self._were_there else found[:-2]  # the last may still be written
+        self._seen.update(map(str, late))
+        self.dropped += len(late)
+        self._were_there = not self._folder
+        return found[len(late) :][::-1]
 
     def _unseen(self) -> list[Path]:
         """Images that were not shown yet, in order. Of the others a folder may hold many thousands."""
