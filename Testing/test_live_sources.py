@@ -355,6 +355,16 @@ def test_feed_ends_after_the_last_file_and_survives_a_driver_that_fails(tmp_path
     assert feed.stop()
 
 
+def test_why_the_only_image_is_not_shown_is_still_said_at_the_end(tmp_path):
+    """The panel waited for a picture without a word."""
+    (tmp_path / "a.png").write_bytes(b"no picture, and yet its end: IEND")
+    feed = Feed(sources.ImageFiles([tmp_path / "a.png"]), lambda _frame: None)
+    feed.start()
+    within(5, lambda: feed.status.state is FeedState.ENDED)
+    assert "a.png: not an image" in feed.status.problem
+    assert feed.stop()
+
+
 def test_a_folder_that_vanishes_is_said_and_found_again(tmp_path):
     folder = tmp_path / "share"
     folder.mkdir()
