@@ -61,3 +61,21 @@ assert "no folder" in panel._message, panel._message
 """,
         tmp_path,
     )
+
+
+def test_the_overview_is_laid_out_for_each_case():
+    """Two patients in turn: the second one's head may lie anywhere else."""
+    in_the_panel(
+        """
+from types import SimpleNamespace
+from ExpectedAppearancesLib.live.status import Status
+from ExpectedAppearancesLib.live.trust import Sight, Verdict
+layout = panel.layout
+layout.views, widget = MagicMock(), MagicMock()
+layout._three_d = lambda _name: widget
+for key in ("first", "first", "second"):
+    result = SimpleNamespace(case_key=key, prediction=None)
+    layout.show(Status(Verdict(Sight.FOLLOWING), result, new=True))
+assert widget.threeDView().resetCamera.call_count == 2
+"""
+    )

@@ -18,7 +18,7 @@ class LayoutSection:
         self._before: int | None = None
         self._banners: list = []
         self._with_mri = False
-        self._overview_fits = False
+        self._overview_of: str | None = None  # the case that the 3D overview shows whole
 
     @property
     def active(self) -> bool:
@@ -49,7 +49,7 @@ class LayoutSection:
             node.SetAxisLabelsVisible(False)
         ids = tuple(node.GetID() for node in (widget.mrmlSliceNode(), *shown_in))
         self.views = live_views.LiveViews(widget.sliceLogic(), self._through, self._depth, ids)
-        self._overview_fits = False
+        self._overview_of = None
         self._restrict_slice(widget.mrmlSliceNode())
         if not self._banners:
             for view in (widget.sliceView(), through.threeDView()):
@@ -78,8 +78,9 @@ class LayoutSection:
         for view, banner in self._banners:
             if banner.say(text, rgb):
                 view.scheduleRender()
-        if self.views is not None and not self._overview_fits and status.new and status.verdict.shows_overlay:
-            self._overview_fits = True
+        shows = self.views is not None and status.new and status.verdict.shows_overlay
+        if shows and status.result.case_key != self._overview_of:
+            self._overview_of = status.result.case_key
             view = self._three_d(live_views.OVERVIEW).threeDView()
             view.resetFocalPoint()
             view.resetCamera()
