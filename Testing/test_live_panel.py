@@ -79,3 +79,25 @@ for key in ("first", "first", "second"):
 assert widget.threeDView().resetCamera.call_count == 2
 """
     )
+
+
+def test_a_landmark_that_was_not_picked_in_the_end_is_not_waited_for():
+    """The next click made a new list of points in the patient's scene."""
+    in_the_panel(
+        """
+slicer.app = MagicMock()
+interaction = slicer.app.applicationLogic().GetInteractionNode()
+selection = slicer.app.applicationLogic().GetSelectionNode()
+panel.align._lists = [MagicMock(), MagicMock()]
+for node, name in zip(panel.align._lists, "FM"):
+    node.GetID.return_value = name
+panel.align._pick(1)
+selection.GetActivePlaceNodeID.return_value = "M"
+interaction.SetCurrentInteractionMode.assert_called_with(interaction.Place)
+panel.align.close()
+interaction.SetCurrentInteractionMode.assert_called_with(interaction.ViewTransform)
+interaction.reset_mock()
+panel.align.close()
+interaction.SetCurrentInteractionMode.assert_not_called()  # the user's own picking goes on
+"""
+    )
