@@ -58,19 +58,20 @@ def layout_description(with_mri: bool) -> str:
 
 class LiveViews:
     """The views of the live layout. slice_logic: of the view that shows the frame. through_view: gives view node,
-    camera node and size (px) of the view through the camera, or None while there is none; depth_node: gives the MRI's
-    slice, or None. line_view_ids: of the views that outlines are drawn in; () for all."""
+    camera node and size (px) of the view through the camera, or None while there is none; depth_view: gives slice node,
+    composite node and volume's id of the MRI's, or None. line_view_ids: of the views that outlines are drawn in; () for
+    all."""
 
     def __init__(
         self,
         slice_logic,
         through_view: Callable[[], tuple | None],
-        depth_node: Callable[[], object | None] = lambda: None,
+        depth_view: Callable[[], tuple | None] = lambda: None,
         line_view_ids: tuple[str, ...] = (),
     ):
         self._slice, self._composite = slice_logic.GetSliceNode(), slice_logic.GetSliceCompositeNode()
         self._intensity = UnusedIntensity(slice_logic)
-        self._through_view, self._depth_node = through_view, depth_node
+        self._through_view, self._depth_view = through_view, depth_view
         self._line_view_ids = line_view_ids
         self._fitted: tuple | None = None
         self._depth_fitted = None
@@ -92,7 +93,7 @@ class LiveViews:
         visible = live.vessels_visible
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
-        depth = self._depth_node()
+        depth = self._depth_view()
         if depth is not None:
             self._follow_in_depth(depth, live, camera_to_world, changed)
         through = self._through_view()
@@ -110,17 +111,20 @@ class LiveViews:
         of the picture behind them."""
         return self._aimed is not None and self._aimed[1] != _place_of(self._aimed[0])
 
-    def _follow_in_depth(self, depth, live: LiveScene, camera_to_world: np.ndarray, changed: bool) -> None:
+    def _follow_in_depth(self, view: tuple, live: LiveScene, camera_to_world: np.ndarray, changed: bool) -> None:
+        slice_node, composite, volume_id = view
         visible = live.overlay_visible
-        if bool(depth.GetSliceVisible()) != visible:
-            depth.SetSliceVisible(visible)
+        wanted = volume_id if visible else None
+        if composite.GetBackgroundVolumeID() != wanted:
+            composite.SetBackgroundVolumeID(wanted)
+        if bool(slice_node.GetSliceVisible()) != visible:
+            slice_node.SetSliceVisible(visible)
         if not visible:
-            put_slice_away(depth)
             return
-        align_depth_slice(depth, camera_to_world, live.plane_mm)
-        if changed or self._depth_fitted is not depth:
-            self._depth_fitted = depth
-            fit_slice(depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
+        align_depth_slice(slice_node, camera_to_world, live.plane_mm)
+        if changed or self._depth_fitted is not slice_node:
+            self._depth_fitted = slice_node
+            fit_slice(slice_node, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
 
     def let_go(self) -> None:
         """The view samples as Slicer does by itself; the layers stay."""
@@ -290,13 +294,6 @@ def look_away(camera_node) -> None:
     camera_node.SetFocalPoint(x, y, z + 1e5)
     camera_node.SetPosition(x, y, z + 1e5 - 1)
     camera_node.SetViewUp(0, 1, 0)
-
-
-def put_slice_away(slice_node) -> None:
-    """Off the patient: what it cut belonged to a pose that does not hold any more."""
-    away = np.eye(4)
-    away[2, 3] = 1e5
-    _set_slice_to_ras(slice_node, away)
 
 
 def _set_slice_to_ras(slice_node, matrix: np.ndarray) -> None:

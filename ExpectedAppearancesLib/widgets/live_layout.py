@@ -18,6 +18,7 @@ class LayoutSection:
         self._before: int | None = None
         self._banners: list = []
         self._with_mri = False
+        self._mri_id: str | None = None
         self._overview_of: str | None = None  # the case that the 3D overview shows whole
 
     @property
@@ -86,13 +87,14 @@ class LayoutSection:
             view.resetCamera()
 
     def show_mri(self, volume) -> bool:
-        """Put a volume into the depth view; without one there is no such view. True when that view has come: the views
-        have to follow the frame again, and it with them."""
+        """The volume for the depth view; without one there is no such view. True when it has come: the views put it up
+        where they follow the frame again."""
         manager = slicer.app.layoutManager()
         if manager is None:
             return False
-        has_come = volume is not None and not self._with_mri
-        self._with_mri = volume is not None
+        wanted_id = volume.GetID() if volume is not None else None
+        has_come = wanted_id not in (None, self._mri_id)
+        self._mri_id, self._with_mri = wanted_id, volume is not None
         layout_node = manager.layoutLogic().GetLayoutNode()
         wanted = live_views.add_layout(layout_node, self._with_mri)
         if layout_node.GetViewArrangement() in self._layout_ids(layout_node) - {wanted}:
@@ -101,10 +103,10 @@ class LayoutSection:
         if widget is None:
             return False
         composite = widget.sliceLogic().GetSliceCompositeNode()
-        composite.SetBackgroundVolumeID(volume.GetID() if volume is not None else None)
         composite.SetForegroundVolumeID(None)
         composite.SetLabelVolumeID(None)
         if volume is None:
+            composite.SetBackgroundVolumeID(None)
             widget.mrmlSliceNode().SetSliceVisible(False)
         self._restrict_slice(widget.mrmlSliceNode())
         return has_come
@@ -113,10 +115,12 @@ class LayoutSection:
     def _layout_ids(layout_node) -> set[int]:
         return {live_views.add_layout(layout_node, with_mri) for with_mri in (False, True)}
 
-    def _depth(self):
-        """The MRI's slice, or None without an MRI."""
+    def _depth(self) -> tuple | None:
+        """Slice node, composite node and the volume's id of the MRI's view, or None without an MRI."""
         widget = slicer.app.layoutManager().sliceWidget(live_views.MRI) if self._with_mri else None
-        return None if widget is None else widget.mrmlSliceNode()
+        if widget is None:
+            return None
+        return widget.mrmlSliceNode(), widget.sliceLogic().GetSliceCompositeNode(), self._mri_id
 
     def _through(self) -> tuple | None:
         """View node, camera node and size of the view through the camera."""
