@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.demo.phantom import covered_frame
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.live.trust import Sight
 from ExpectedAppearancesLib.registration.poses_file import read_poses
 
 slicer = pytest.importorskip("slicer")
 
-from live_cases import add_of, camera_to_ras_of, choice_of, node_with, send, wait_for  # noqa: E402
-from mrml_views import new_application  # noqa: E402
+from live_cases import SMALL, add_of, camera_to_ras_of, choice_of, node_with, send, wait_for  # noqa: E402
+from mrml_views import SliceView, ThreeDView, new_application  # noqa: E402
 
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
+from ExpectedAppearancesLib.mrml.live_views import LiveViews  # noqa: E402
 
 
 @pytest.fixture
@@ -122,6 +125,37 @@ def test_alignment_holds_when_the_user_transforms_the_models(application, phanto
     assert {node.GetTransformNodeID() for node in models} == {patient.GetID()}
     for node in (in_frame, on_mesh, patient):
         scene.RemoveNode(node)
+    controller.close()
+
+
+def test_vessels_are_seen_over_a_refused_frame_while_they_are_aligned_to_it(application, phantom, model):
+    """It is such frames that need it most; before and after, nothing lies over them."""
+    scene, logic = application
+    node_with(scene, covered_frame(1, SMALL))
+    view = SliceView(scene, logic, "Microscope", (320, 240))
+    through = ThreeDView(scene, logic, "MicroscopeCamera", (160, 120))
+    controller = LiveController(scene, LiveViews(view.logic, lambda: (through.node, through.camera_node, (160, 120))))
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.REFUSED
+    live = controller.live
+
+    def is_seen() -> bool:
+        apart_mm = np.linalg.norm(np.array(through.camera_node.GetPosition()) - live.camera_to_world[:3, 3])
+        assert bool(live.backdrop.GetDisplayNode().GetVisibility()) == (apart_mm < 1e-3)
+        return apart_mm < 1e-3
+
+    for _again in range(2):
+        assert not is_seen()
+        controller.begin_alignment()
+        controller.tick()
+        assert is_seen() and not live.overlay_visible
+        # The frame fills the view, however far off the vessels are.
+        shown_mm = np.array(view.node.GetFieldOfView()[:2])
+        frame_mm = live.plane_mm * np.array([SMALL.width / SMALL.fx, SMALL.height / SMALL.fy])
+        assert (shown_mm / frame_mm).max() == pytest.approx(1, abs=0.12)
+        controller.finish_alignment(keep=True)
+        controller.tick()
+    assert not is_seen() and live.lines["truth"].GetDisplayNode().GetVisibility()
     controller.close()
 
 

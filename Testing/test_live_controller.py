@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ import pytest
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.demo.phantom import covered_frame, make_phantom
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.geometry.camera import write_camera
 from ExpectedAppearancesLib.live.choice import SourceKind
 from ExpectedAppearancesLib.live.estimator import open_model
+from ExpectedAppearancesLib.live.feed import FeedState
+from ExpectedAppearancesLib.live.frames import FrameSettings
 from ExpectedAppearancesLib.live.trust import Sight
 from ExpectedAppearancesLib.registration.poses_file import write_poses
 
@@ -103,8 +107,11 @@ def test_overlay_goes_when_frames_stop_and_returns_with_them(application, phanto
     now = [100.0]
     controller = LiveController(scene, clock=lambda: now[0])
     controller.start(choice_of(phantom, stale_s=0.5), model=model)
-    wait_for(controller, lambda s: s.new)
-    assert controller.status.verdict.sight is Sight.FOLLOWING
+    # What the stream held at the start may be of a stream that stopped yesterday.
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.STALE
+    assert not controller.live.overlay_visible and controller.status.latency_ms is None
+    send(stream, images[1])
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     now[0] += 0.6
     assert controller.tick().verdict.sight is Sight.STALE
     assert not controller.live.overlay_visible
@@ -153,10 +160,55 @@ def test_the_picture_that_is_shown_is_no_source(application, phantom, model, fra
     controller.close()
 
 
+def test_a_stream_that_returns_is_told_from_a_view_of_its_name_and_from_the_panels_own_picture(application, frames):
+    """The layout's slice is called Microscope, as many a stream is."""
+    scene, _logic = application
+    for class_name, own in (("vtkMRMLSliceNode", False), ("vtkMRMLVectorVolumeNode", True)):
+        same_name = scene.AddNewNodeByClass(class_name, "Stream")
+        if own:
+            same_name.SetAttribute("ExpectedAppearances.Live", "frame")
+            send(same_name, frames[1][7])
+    stream = node_with(scene, frames[1][0])
+    came = []
+    source = NodeFrames(scene, stream, came.append)
+    scene.RemoveNode(stream)
+    assert source.look().state is FeedState.LOST
+    node_with(scene, frames[1][1])
+    assert source.look().state is FeedState.RUNNING
+    assert [np.array_equal(came[-1].image_rgb, frames[1][i]) for i in (1, 7)] == [True, False]
+    source.close()
+
+
+def test_pictures_that_cannot_be_decoded_are_no_new_frames(application, frames):
+    """The node's image is then still the one before, and counts as changed: it would never get too old."""
+    scene, _logic = application
+    encoder = scene.AddNewNodeByClass("vtkMRMLStreamingVolumeNode", "Encoder")
+    encoder.SetCodecFourCC("RV24")
+
+    def compressed(image):
+        send(encoder, image)
+        assert encoder.EncodeImageData(True)
+        return encoder.GetFrame()
+
+    stream = scene.AddNewNodeByClass("vtkMRMLStreamingVolumeNode", "Stream")
+    came = []
+    source = NodeFrames(scene, stream, came.append)
+    stream.SetAndObserveFrame(compressed(frames[1][0]))
+    assert len(came) == 1 and not source.look().problem
+    unknown = compressed(frames[1][1])
+    unknown.SetCodecFourCC("????")
+    stream.SetAndObserveFrame(unknown)
+    assert len(came) == 1 and "cannot be decoded" in source.look().problem
+    stream.SetAndObserveFrame(compressed(frames[1][2]))
+    assert len(came) == 2 and not source.look().problem
+    np.testing.assert_array_equal(came[1].image_rgb, frames[1][2])
+    source.close()
+
+
 @pytest.mark.parametrize("removed", ["frame", "Vessels", "outline"])
 def test_nodes_that_the_user_removed_are_there_again_after_a_start(application, phantom, model, frames, removed):
     scene, _logic = application
-    node_with(scene, frames[1][0])
+    stream = node_with(scene, frames[1][0])
     controller = LiveController(scene)
     controller.start(choice_of(phantom, stale_s=60), model=model)
     wait_for(controller, lambda s: s.new)
@@ -164,6 +216,8 @@ def test_nodes_that_the_user_removed_are_there_again_after_a_start(application, 
     live = controller.live
     scene.RemoveNode(live.frame if removed == "frame" else (live.models | live.lines)[removed])
     controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, frames[1][1])
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     live = controller.live
     assert all(scene.IsNodePresent(n) for n in (live.frame, *live.models.values(), *live.lines.values()))
@@ -279,6 +333,23 @@ def test_steps_through_registered_frames_one_by_one(application, phantom, frames
     controller.close()
 
 
+def test_registered_frames_are_shown_as_they_were_registered(application, phantom, frames, tmp_path):
+    """What was set for a microscope before, its camera and that it sends the lowest row first, is not theirs."""
+    scene, _logic = application
+    files.write_png(tmp_path / "0.png", frames[1][0])
+    poses = [{"image": tmp_path / "0.png", "camera_from_world": frames[0][0]}]
+    write_poses(tmp_path / "poses.json", SMALL, poses)
+    write_camera(tmp_path / "camera.json", replace(SMALL, fx=1.1 * SMALL.fx, fy=1.1 * SMALL.fy))
+    of_another = {"camera_path": str(tmp_path / "camera.json"), "frames": FrameSettings(flip_rows=True)}
+    controller = LiveController(scene)
+    choice = choice_of(phantom, kind=SourceKind.PATH, path=str(tmp_path / "poses.json"), **of_another)
+    controller.start(choice)
+    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FROZEN
+    np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][0])
+    assert controller.camera.matrix == pytest.approx(SMALL.matrix)
+    controller.close()
+
+
 def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(application, phantom, model, frames):
     scene, _logic = application
     stream = node_with(scene, frames[1][0])
@@ -292,11 +363,13 @@ def test_scene_close_in_mid_stream_leaves_nothing_and_the_next_session_works(app
     assert controller.tick().verdict.sight is Sight.IDLE
     assert no_thread_is_left()
     after_close = scene.GetNumberOfNodes()
-    node_with(scene, frames[1][2])
+    stream = node_with(scene, frames[1][2])
     controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, frames[1][3])
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
     controller.close()
-    scene.RemoveNode(scene.GetFirstNodeByName("Stream"))
+    scene.RemoveNode(stream)
     assert scene.GetNumberOfNodes() == after_close
 
 

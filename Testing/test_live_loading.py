@@ -76,7 +76,7 @@ def test_the_gui_goes_on_while_the_model_is_read(started, gate, frames):
     controller.freeze()
     controller.next_frame()
     gate.open.set()
-    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
+    assert wait_for(controller, lambda s: s.new).result.accepted
     assert not controller.loading and controller.status.problem == ""
     assert gate.threads and threading.main_thread() not in gate.threads
     np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][0])
@@ -115,7 +115,7 @@ def test_what_keeps_it_from_starting_is_said_and_the_next_start_works(started, g
     gate.problem = None
     controller.start(choice_of(phantom, stale_s=60))
     assert controller.status.problem == ""
-    assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.FOLLOWING
+    assert wait_for(controller, lambda s: s.new).result.accepted
 
 
 def test_what_is_wrong_with_the_case_is_said_too(started, phantom, tmp_path):

@@ -6,6 +6,7 @@ import cases
 import numpy as np
 import pytest
 
+from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at, transform
@@ -99,6 +100,20 @@ def test_export_refuses_a_change_of_camera_and_an_empty_recording(tmp_path):
     assert not (tmp_path / "a" / "poses.json").exists()
     with pytest.raises(InputError, match="no frame"):
         recording.export_recording(tmp_path / "b", [])
+
+
+def test_a_true_pose_that_is_corrected_takes_the_place_of_the_one_before(tmp_path):
+    """Both would count in `evaluate`, and the wrong one could not be taken out."""
+    prediction = Prediction(POSE, True, 0.9, 1.0)
+    frames = [recording.RecordedFrame(0.0, "f", CAMERA, prediction, noise(seed=i)) for i in (0, 1)]
+    corrected = alignment.nudged(POSE, cases.vessels().centroid_mm, np.array([1.0, 2.0, 3.0]), np.zeros(3))
+    recording.add_truth(tmp_path, frames[0], POSE)
+    recording.add_truth(tmp_path, frames[1], POSE)
+    _camera, saved = read_poses(recording.add_truth(tmp_path, frames[1], corrected))
+    assert len(saved) == 2
+    for frame, expected, pose in zip(saved, frames, (POSE, corrected)):
+        np.testing.assert_array_equal(files.read_image_rgb(frame.image), expected.image_rgb)
+        np.testing.assert_allclose(frame.camera_from_world, pose)
 
 
 def test_true_poses_of_a_camera_whose_distortion_was_taken_out_are_collected_in_one_file(tmp_path):

@@ -8,8 +8,13 @@ import pytest
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.demo.phantom import PhantomPainter, covered_frame, make_phantom
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.live.estimator import case_key
+from ExpectedAppearancesLib.live.frames import LiveFrame
+from ExpectedAppearancesLib.live.overlay import OverlayMaker
+from ExpectedAppearancesLib.live.session import LiveResult
 from ExpectedAppearancesLib.live.trust import Sight
 from ExpectedAppearancesLib.registration.poses_file import read_poses
+from ExpectedAppearancesLib.registration.predictor import Prediction
 
 slicer = pytest.importorskip("slicer")
 
@@ -177,6 +182,48 @@ def test_a_recording_of_another_case_shows_no_overlay(application, phantom, mode
     controller.close()
 
 
+@pytest.mark.parametrize("damaged", ["note", "case", "no case"])
+def test_no_overlay_stays_where_a_recording_cannot_be_looked_at_any_more(application, phantom, model, frames, damaged):
+    """Slicer plays its frames all the same, and they would have the overlay of the last one that could be."""
+    scene, logic = application
+    controller = LiveController(scene)
+    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+    browser.SetSelectedItemNumber(0)
+    case = str(phantom.case.folder)
+    assert controller.look_at(browser, case).verdict.shows_overlay
+    browser.SetSelectedItemNumber(1)
+    logic.sequences.UpdateProxyNodesFromSequences(browser)
+    if damaged == "no case":
+        assert controller.look_at(browser, "").verdict.sight is Sight.IDLE
+    else:
+        note = live_record._sequence(browser, "note").GetNthDataNode(1)
+        whole = note.GetText()
+        note.SetText("{}" if damaged == "note" else whole)
+        with pytest.raises(InputError):
+            controller.look_at(browser, str(phantom.case.folder.parent) if damaged == "case" else case)
+        note.SetText(whole)
+    assert not controller.live.overlay_visible and controller.tick().verdict.sight is Sight.IDLE
+    assert controller.look_at(browser, case).verdict.shows_overlay and controller.live.overlay_visible
+    controller.close()
+
+
+@pytest.mark.parametrize("removed", ["frame", "transform"])
+def test_a_recording_is_seen_again_although_the_user_removed_what_it_plays_into(
+    application, phantom, model, frames, removed
+):
+    """Slicer makes such a node anew, under no transform."""
+    scene, _logic = application
+    controller = LiveController(scene)
+    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+    case = str(phantom.case.folder)
+    controller.look_at(browser, case)
+    scene.RemoveNode(getattr(controller.live, removed))
+    assert controller.look_at(browser, case).verdict.shows_overlay
+    np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][1])
+    assert controller.live.frame.GetParentTransformNode() is controller.live.transform
+    controller.close()
+
+
 def test_export_gives_poses_images_and_transforms(application, phantom, model, frames, tmp_path):
     scene, _logic = application
     controller = LiveController(scene)
@@ -189,7 +236,7 @@ def test_export_gives_poses_images_and_transforms(application, phantom, model, f
         np.testing.assert_array_equal(files.read_image_rgb(frame.image), images[i])
         assert frame.accepted == predicted[i].accepted
         transform = tmp_path / "out" / "transforms" / f"{i:05d}.tfm"
-        assert transform.is_file() == (predicted[i].camera_from_world is not None)
+        assert transform.is_file() == frame.accepted
         if not frame.accepted:
             continue
         np.testing.assert_allclose(frame.camera_from_world, predicted[i].camera_from_world, atol=1e-12)
@@ -200,6 +247,46 @@ def test_export_gives_poses_images_and_transforms(application, phantom, model, f
         np.testing.assert_allclose(camera_to_ras_of(node), expected, atol=1e-6)
     times = [frame.extra["time_s"] for frame in exported]
     assert times == sorted(times) and times[0] == 0
+    controller.close()
+
+
+def test_a_recording_in_which_the_frames_changed_their_size_is_exported(application, phantom, model, frames, tmp_path):
+    """One poses.json has one camera, and nobody can record again."""
+    scene, _logic = application
+    controller = LiveController(scene)
+    large = np.repeat(np.repeat(frames[1][5], 2, axis=0), 2, axis=1)
+    images = [frames[1][0], large, frames[1][9]]
+    browser, predicted = record(controller, scene, phantom, model, images)
+    folder = live_record.export(browser, tmp_path / "out", phantom.case)
+    for name, items in (("camera_1", (0, 2)), ("camera_2", (1,))):
+        camera, exported = read_poses(folder / name / "poses.json")
+        assert len(exported) == len(items)
+        for number, (item, frame) in enumerate(zip(items, exported)):
+            np.testing.assert_array_equal(files.read_image_rgb(frame.image), images[item])
+            assert images[item].shape == (camera.height, camera.width, 3)
+            np.testing.assert_allclose(frame.camera_from_world, predicted[item].camera_from_world, atol=1e-12)
+            assert (folder / name / "transforms" / f"{number:05d}.tfm").is_file()
+    controller.close()
+
+
+def test_a_refused_pose_is_exported_with_its_refusal_only(application, phantom, frames, tmp_path):
+    """A transform's file has no place for it: loaded, it would look like any other."""
+    scene, _logic = application
+    controller = LiveController(scene)
+    controller.open_case(phantom.case.folder)
+    recorder = None
+    for i, accepted in enumerate((True, False)):
+        pose, image = frames[0][i], frames[1][i]
+        overlay = OverlayMaker(phantom.case.vessels).make(SMALL, pose) if accepted else None
+        frame, prediction = LiveFrame(image, float(i), i, f"{i}"), Prediction(pose, accepted, 0.5, 1.0)
+        result = LiveResult(frame, case_key(phantom.case), image, SMALL, prediction, overlay)
+        controller.live.show(result)
+        recorder = recorder or live_record.Recorder(controller.live)
+        assert recorder.add(result)
+    _camera, exported = read_poses(live_record.export(recorder.finish(), tmp_path, phantom.case))
+    assert [frame.accepted for frame in exported] == [True, False]
+    assert all(frame.camera_from_world is not None for frame in exported)
+    assert [path.name for path in (tmp_path / "transforms").iterdir()] == ["00000.tfm"]
     controller.close()
 
 
@@ -228,6 +315,8 @@ def test_a_steadied_session_draws_and_records_the_filtered_pose(application, pha
     stream = node_with(scene, images[0])
     controller = LiveController(scene, clock=lambda: now[0])
     controller.start(choice_of(phantom, stale_s=60, steady=True), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, images[0])
     assert wait_for(controller, lambda s: s.new).verdict.sight is Sight.VIEW_LOST  # one frame is no motion yet
     controller.start_recording()
     drawn = []

@@ -22,6 +22,7 @@ slicer = pytest.importorskip("slicer")
 from mrml_views import SliceView, ThreeDView, new_application  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import live_views  # noqa: E402
+from ExpectedAppearancesLib.mrml.live_align import Alignment  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_scene import PREDICTED_RGB, LiveScene, OverlayOptions  # noqa: E402
 
 CAMERA = Camera(640, 480, 1350.0, 1350.0, 350.0, 215.0)  # off-centre on purpose
@@ -334,6 +335,22 @@ def test_three_hundred_frames_leave_as_many_nodes_observers_and_bytes_as_three(a
 
     first = go(9)
     assert go(300) == first
+
+
+def test_no_display_node_is_saved_whose_node_is_not(application, case):
+    """A loaded scene would keep it for ever, and each time it is saved again one more."""
+    scene, _logic = application
+    live = LiveScene(scene, case)
+    live.show(result_of(case))
+    live.show_backdrop("vtkMRMLViewNode1")
+    alignment = Alignment(live, case, POSE)
+    nodes = [scene.GetNthNode(i) for i in range(scene.GetNumberOfNodes())]
+    displayed = [n for n in nodes if hasattr(n, "GetDisplayNode") and n.GetDisplayNode() is not None]
+    unsaved = [n for n in displayed if not n.GetSaveWithScene()]
+    assert len(unsaved) >= 6
+    assert [n.GetName() for n in unsaved if n.GetDisplayNode().GetSaveWithScene()] == []
+    alignment.finish()
+    live.close()
 
 
 def test_closing_takes_every_node_away_and_the_next_session_leaves_no_second(application, case):

@@ -15,6 +15,7 @@ from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.live import sources
 from ExpectedAppearancesLib.live.choice import Choice, SourceKind, open_source, problems_of
 from ExpectedAppearancesLib.live.feed import Feed, FeedState
+from ExpectedAppearancesLib.registration.footage import VIDEO_SUFFIXES
 from ExpectedAppearancesLib.registration.poses_file import write_poses
 
 
@@ -75,6 +76,64 @@ def test_a_file_is_taken_only_when_it_is_whole(tmp_path, suffix):
     assert found.image_rgb.shape == image.shape
     if suffix != ".jpg":
         np.testing.assert_array_equal(found.image_rgb, image)
+
+
+@pytest.mark.parametrize("only_new", [False, True])
+def test_a_folder_of_thousands_is_not_sorted_for_each_image(tmp_path, monkeypatch, only_new):
+    """Looking for the next image took longer than to register one, again and again while none came."""
+    data = cv2.imencode(".png", noise(40, 32))[1].tobytes()
+    for i in range(50):
+        (tmp_path / f"{i}.png").write_bytes(data)
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, only_new=only_new)
+    source.open()
+    looked_at = []
+    in_order = sources._natural_order
+    monkeypatch.setattr(sources, "_natural_order", lambda path: looked_at.append(path) or in_order(path))
+    if only_new:
+        (tmp_path / "50.png").write_bytes(data)
+    names = ["50.png"] if only_new else [f"{i}.png" for i in range(50)]
+    assert [frame.name for frame in read_all(source, len(names))] == names
+    assert read_all(source, 1, 0.05) == [] and len(looked_at) == len(names)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp"])
+def test_a_folder_that_is_filled_faster_than_it_is_shown_stays_in_the_present(tmp_path, suffix):
+    """Shown one by one, the pictures were ever older, and as new as if they had just been taken; so after a pause."""
+    data = cv2.imencode(suffix, noise(40, 32))[1].tobytes()
+    now, shown, written = [0.0], [], 0
+
+    def write_up_to(number):
+        nonlocal written
+        while written < number:
+            written += 1
+            (tmp_path / f"{written}{suffix}").write_bytes(data)
+
+    write_up_to(5)
+    source = sources.ImageFiles(tmp_path, rate_hz=10, clock=lambda: now[0])
+    source.open()
+    for step in range(200):
+        now[0] += 0.05
+        if step >= 50:
+            write_up_to(5 + 2 * (step - 49))  # 40 a second
+        frame = source.read()
+        if frame is not None:
+            shown.append(int(frame.name.split(".")[0]))
+            assert shown[-1] <= 5 or written - shown[-1] < 25
+    assert shown[:5] == [1, 2, 3, 4, 5]  # those that were there
+    assert shown == sorted(shown) and len(shown) > 20
+    assert source.dropped + len(shown) > written - 25
+
+
+def test_an_image_that_is_taken_away_before_its_turn_does_not_hold_up_the_others(tmp_path):
+    write_images(tmp_path, ["1.png", "2.png", "3.png"])
+    now = [0.0]
+    source = sources.ImageFiles(tmp_path, rate_hz=1000, clock=lambda: now[0])
+    source.open()
+    assert source.read().name == "1.png"
+    (tmp_path / "2.png").unlink()
+    now[0] += 0.01
+    assert source.read() is None
+    assert source.read().name == "3.png"
 
 
 def test_a_file_that_never_gets_whole_is_said_and_left_out(tmp_path):
@@ -296,6 +355,16 @@ def test_feed_ends_after_the_last_file_and_survives_a_driver_that_fails(tmp_path
     assert feed.stop()
 
 
+def test_why_the_only_image_is_not_shown_is_still_said_at_the_end(tmp_path):
+    """The panel waited for a picture without a word."""
+    (tmp_path / "a.png").write_bytes(b"no picture, and yet its end: IEND")
+    feed = Feed(sources.ImageFiles([tmp_path / "a.png"]), lambda _frame: None)
+    feed.start()
+    within(5, lambda: feed.status.state is FeedState.ENDED)
+    assert "a.png: not an image" in feed.status.problem
+    assert feed.stop()
+
+
 def test_a_folder_that_vanishes_is_said_and_found_again(tmp_path):
     folder = tmp_path / "share"
     folder.mkdir()
@@ -322,6 +391,11 @@ def test_choice_lists_all_that_is_missing_and_opens_what_is_there(tmp_path, vide
     assert "Choose the volume" in problems_of(Choice(kind=SourceKind.NODE))[-1]
     assert isinstance(open_source(Choice(path=str(tmp_path))).source, sources.ImageFiles)
     assert isinstance(open_source(Choice(path=str(video))).source, sources.VideoFile)
+    for suffix in VIDEO_SUFFIXES:  # all that `register` takes, as the .mts of many recorders
+        path = tmp_path / f"video{suffix}"
+        path.write_bytes(b"")
+        assert isinstance(open_source(Choice(path=str(path))).source, sources.VideoFile)
+        assert "not a kind of file" not in problems_of(Choice(path=str(path)))[-1]
     write_images(tmp_path, ["1.png"])
     assert open_source(Choice(path=str(tmp_path / "1.png"))).still
     with pytest.raises(InputError, match=r"a\.txt"):

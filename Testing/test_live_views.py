@@ -18,8 +18,8 @@ from ExpectedAppearancesLib.registration.predictor import Prediction
 slicer = pytest.importorskip("slicer")
 
 import vtk  # noqa: E402
-from live_cases import choice_of, record, wait_for  # noqa: E402
-from mrml_views import SliceView, new_application  # noqa: E402
+from live_cases import choice_of, node_with, record, wait_for  # noqa: E402
+from mrml_views import SliceView, ThreeDView, new_application  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import live_views  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
@@ -144,6 +144,23 @@ def test_the_filled_vessels_are_a_layer_only_while_they_are_seen(case, watched):
     assert ours.composite.GetLabelVolumeID() is None
 
 
+def test_the_mri_is_cut_along_the_optical_axis_only_while_the_pose_holds(case, application):
+    """No words stand over that view: what is seen in it must be of this frame."""
+    scene, logic = application
+    ours, mri = SliceView(scene, logic, "Microscope", SIZE), SliceView(scene, logic, "MicroscopeMRI", SIZE)
+    scan_id = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "MRI").GetID()
+    live = LiveScene(scene, case)
+    views = LiveViews(ours.logic, lambda: None, lambda: (mri.node, mri.composite, scan_id))
+    for accepted in (True, False, True):
+        live.show(result_of(case, accepted))
+        views.follow(live, False)
+        assert mri.composite.GetBackgroundVolumeID() == (scan_id if accepted else None)
+        assert mri.node.GetSliceVisible() == accepted
+        to_slice = np.linalg.inv(vtk_matrix_values(mri.node.GetSliceToRAS()))
+        axis = live.camera_to_world @ np.array([(0, 0, 0, 1), (0, 0, live.plane_mm, 1)]).T
+        np.testing.assert_allclose((to_slice @ axis)[2], 0, atol=1e-6)
+
+
 def test_lines_that_were_not_wanted_are_those_of_the_frame_when_they_are(case, watched):
     """They are not worked out while they are hidden, so they must be when they are shown."""
     live, _views, _ours, _layers = watched
@@ -200,6 +217,29 @@ def test_views_follow_when_the_user_moves_the_models_under_a_frame_that_is_held(
     truth = controller.truth
     move_and_look(controller.tick)
     assert controller.truth is truth and controller.live.lines["truth"].GetDisplayNode().GetVisibility()
+    controller.close()
+
+
+def test_the_view_through_the_camera_stays_there_while_a_frame_is_held(application, phantom, model, frames):
+    """Zoomed or turned, vessels would lie on other parts of the picture behind them, under words that they belong to
+    it."""
+    scene, logic = application
+    view = SliceView(scene, logic, "Microscope", SIZE)
+    through = ThreeDView(scene, logic, "MicroscopeCamera", (160, 120))
+    controller = LiveController(scene, LiveViews(view.logic, lambda: (through.node, through.camera_node, (160, 120))))
+    node_with(scene, frames[1][0])
+    controller.start(choice_of(phantom, stale_s=60), single=True, model=model)
+    wait_for(controller, lambda s: s.new)
+    camera = through.camera_node.GetCamera()
+    for move in (lambda: camera.Dolly(1.5), lambda: camera.Azimuth(20), lambda: camera.SetParallelProjection(True)):
+        move()
+        controller.tick()
+        np.testing.assert_allclose(camera.GetPosition(), controller.live.camera_to_world[:3, 3])
+        assert not camera.GetParallelProjection()
+    controller.stop()
+    away = camera.GetPosition()
+    controller.tick()
+    assert camera.GetPosition() == away and away[2] > 10_000
     controller.close()
 
 

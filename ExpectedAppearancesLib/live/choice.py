@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
 from ..case.case import MANIFEST_NAME
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera, read_camera
+from ..registration.footage import VIDEO_SUFFIXES
 from .estimator import given_poses, poses_of_video
 from .frames import FrameSettings
-from .sources import IMAGE_SUFFIXES, USUAL_RATE_HZ, VIDEO_SUFFIXES, CaptureDevice, ImageFiles, Source, VideoFile
+from .sources import IMAGE_SUFFIXES, USUAL_RATE_HZ, CaptureDevice, ImageFiles, Source, VideoFile
 
 
 class SourceKind(Enum):
@@ -45,6 +46,11 @@ class Choice:
     def needs_model(self) -> bool:
         """False for frames whose poses come from a file."""
         return not (self.kind is SourceKind.PATH and self.path.lower().endswith(".json"))
+
+    @property
+    def frame_settings(self) -> FrameSettings:
+        """`frames`, but that a frame whose pose comes from a file stays as it was registered."""
+        return self.frames if self.needs_model else replace(self.frames, flip_rows=False)
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,8 @@ def problems_of(choice: Choice) -> list[str]:
 
 
 def open_source(choice: Choice, case_camera: Camera | None = None) -> OpenedSource:
-    """The source that was chosen. case_camera: of the frames, unless the choice or poses.json names another.
+    """The source that was chosen. case_camera: of the frames, unless the choice names another; poses.json names that
+    of its poses, and with no other one are they drawn right.
 
     Raises InputError with every problem.
     """
@@ -93,7 +100,7 @@ def open_source(choice: Choice, case_camera: Camera | None = None) -> OpenedSour
     with problems.collect():
         opened = _opened(choice, camera or case_camera)
     problems.raise_if_any()
-    return OpenedSource(opened.source, camera or opened.camera, opened.still)
+    return OpenedSource(opened.source, opened.camera or camera, opened.still)
 
 
 def _opened(choice: Choice, camera: Camera | None) -> OpenedSource:

@@ -69,7 +69,7 @@ class Feed:
                     self._set(FeedState.RUNNING)
                     self._read_until_lost()
                 except SourceEnded:
-                    self._set(FeedState.ENDED)
+                    self._set(FeedState.ENDED, self._status.problem)  # of a last frame that could not be read
                     return
                 except (SourceLost, InputError) as error:
                     self._set(FeedState.LOST, str(error))

@@ -22,7 +22,8 @@ BLANK_RANGE = 6  # of 255 between the darkest and brightest sample: a picture ha
 
 @dataclass(frozen=True, eq=False)
 class LiveFrame:
-    """One frame of a source: uint8 RGB (H, W, 3) as it came, when it came (s, monotonic clock), its number and name.
+    """One frame of a source: uint8 RGB (H, W, 3) as it came, when it came (s, monotonic clock; -inf for one that was
+    there before anybody looked), its number and name.
 
     given: the pose that comes with the frame, where it was registered before; such a frame is not predicted again.
     """

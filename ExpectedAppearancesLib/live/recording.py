@@ -149,7 +149,8 @@ def _known(confidence: float) -> float | None:
 
 
 def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray) -> Path:
-    """Add a frame with its true pose to folder/poses.json, as `evaluate` reads it; returns the path of the file.
+    """Add a frame with its true pose to folder/poses.json, as `evaluate` reads it; returns the path of the file. The
+    frame that was added last gets the new pose.
 
     Raises InputError when the file has another camera, or is damaged.
     """
@@ -161,6 +162,11 @@ def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray)
         if camera is None or camera.to_dict() != frame.camera.to_dict():
             raise InputError(f"{path}: holds frames of another camera or size; choose another folder.")
         entries = [f.to_dict() for f in known]
+        last = known[-1].image
+        if last.is_file() and np.array_equal(files.read_image_rgb(last), frame.image_rgb):
+            entries[-1]["camera_from_world"] = camera_from_world
+            write_poses(path, frame.camera, entries)
+            return path
     number = len(entries)
     while (image := Path(folder) / "frames" / f"{number:05d}.png").exists():
         number += 1

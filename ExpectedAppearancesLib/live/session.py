@@ -155,7 +155,8 @@ class LiveSession:
         self._hold_source(False)
 
     def next_frame(self) -> None:
-        """Register one more frame, then hold again; of files and videos it is the very next one."""
+        """Register one more frame, then hold again; of files and videos it is the very next one, unless they came
+        only now."""
         self._frozen, self._single = False, True
         self._hold_source(False)
 
@@ -217,7 +218,8 @@ class LiveSession:
 
     def _steadied(self, frame: LiveFrame, prediction: Prediction | None) -> Steadied | None:
         """In the worker's thread, which alone touches the filter."""
-        if not self.steady or self._single or frame.given is not None or not can_steady(self._estimator):
+        stands_alone = self._single or frame.given is not None or not math.isfinite(frame.taken_s)
+        if not self.steady or stands_alone or not can_steady(self._estimator):
             self._steadying = None
             return None
         if self._steadying is None:

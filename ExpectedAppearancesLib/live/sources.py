@@ -6,6 +6,7 @@ SourceLost when it has to be opened again. Sources pace themselves, so that a vi
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Callable, Iterable
@@ -21,9 +22,9 @@ if TYPE_CHECKING:
     from ..registration.predictor import Prediction
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".mpg", ".mpeg", ".wmv", ".m4v")
 DAMAGED_AFTER_S = 2.0  # a file that has not grown for so long and is still not whole never will be
 USUAL_RATE_HZ = 25.0
+REST = 4  # times as long as a look into a folder took, until the next one: of many thousands it takes long
 
 
 class SourceLost(ExpectedAppearancesError):
@@ -53,8 +54,9 @@ class Source(Protocol):
 class ImageFiles:
     """The images of a list or folder, in the order of the numbers in their names, `rate_hz` of them a second.
 
-    A folder is watched: images that come later follow, as soon as they are whole. only_new leaves out those that were
-    there at the start. given: pose of each image (by path) that was registered before.
+    A folder is watched: images that come later follow, as soon as they are whole; of many that came meanwhile, as
+    during a pause, only the last two, so that what is shown is the present. only_new leaves out those that were there
+    at the start. given: pose of each image (by path) that was registered before.
     """
 
     def __init__(
@@ -66,14 +68,16 @@ class ImageFiles:
         given: dict[Path, Prediction] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._folder = Path(images) if isinstance(images, (str, Path)) else None
+        self._folder = Path(images).absolute() if isinstance(images, (str, Path)) else None
         self._listed = [] if self._folder else [Path(p) for p in images]
         self._interval_s = 1 / max(rate_hz, 0.01)
         self._repeat, self._only_new, self._given, self._clock = repeat, only_new, given or {}, clock
         self.dropped = 0
         self.can_wait = True
         self._number = 0
-        self._seen: set[Path] | None = None
+        self._seen: set[str] | None = None
+        self._next: list[Path] = []  # found and not shown yet, the last one first
+        self._were_there = True  # those of the next look: then all are shown
         self._unfinished: dict[Path, tuple[tuple, float]] = {}
 
     def open(self) -> None:
@@ -83,27 +87,34 @@ class ImageFiles:
             raise InputError("no images are listed; give at least one.")
         self._due_s = self._clock()
         if self._seen is None:
-            self._left_out = set(self._paths()) if self._folder and self._only_new else set()
-            self._seen = set(self._left_out)
+            self._seen = set()
+            self._left_out = set(map(str, self._unseen())) if self._folder and self._only_new else set()
+            self._seen |= self._left_out
 
     def read(self) -> LiveFrame | None:
         if self._clock() < self._due_s:
             return None
-        paths = self._paths()
-        for path in paths:
-            if path in self._seen:
-                continue
+        begin_s = self._clock()
+        if not self._next:
+            self._next = self._found()
+        if self._next:
+            path = self._next.pop()
             data = self._whole_file(path)
-            if data is None:
-                return None  # in order: those after it wait
-            self._seen.add(path)
-            self._due_s = max(self._due_s + self._interval_s, self._clock())
-            self._number += 1
-            return LiveFrame(_decoded(data, path), self._clock(), self._number - 1, path.name, self._given.get(path))
-        if self._repeat and paths:
-            self._seen = set(self._left_out)
+            if data is not None:
+                self._seen.add(str(path))
+                self._due_s = max(self._due_s + self._interval_s, self._clock())
+                self._number += 1
+                image = _decoded(data, path)
+                return LiveFrame(image, self._clock(), self._number - 1, path.name, self._given.get(path))
+            if path.exists():
+                self._next.append(path)  # in order: those after it wait
+            else:
+                self._next, self._were_there = [], True
+        elif self._repeat:
+            self._seen, self._were_there = set(self._left_out), True
         elif not self._folder:
             raise SourceEnded("the last image was shown.")
+        self._due_s = self._clock() + REST * (self._clock() - begin_s)
         return None
 
     def go_on(self) -> None:
@@ -112,16 +123,26 @@ class ImageFiles:
     def close(self) -> None:
         self._unfinished = {}
 
-    def _paths(self) -> list[Path]:
+    def _found(self) -> list[Path]:
+        found = self._unseen()
+        late = [] if self._were_there else found[:-2]  # the last may still be written
+        self._seen.update(map(str, late))
+        self.dropped += len(late)
+        self._were_there = not self._folder
+        return found[len(late) :][::-1]
+
+    def _unseen(self) -> list[Path]:
+        """Images that were not shown yet, in order. Of the others a folder may hold many thousands."""
         if not self._folder:
-            return self._listed
+            return [path for path in self._listed if str(path) not in self._seen]
         try:
-            found = [p for p in self._folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != "."]
+            with os.scandir(self._folder) as entries:
+                new = [Path(entry.path) for entry in entries if entry.path not in self._seen]
         except OSError as error:
             raise SourceLost(
                 f"{self._folder}: folder cannot be read ({error.strerror}); check the drive or the network."
             ) from error
-        return sorted(found, key=_natural_order)
+        return sorted((p for p in new if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != "."), key=_natural_order)
 
     def _whole_file(self, path: Path) -> bytes | None:
         """The file's content, or None while it is being written. Raises InputError for one that never gets whole."""
@@ -133,7 +154,7 @@ class ImageFiles:
             data = path.read_bytes()
         except OSError as error:  # locked by its writer, renamed, or never to be read
             if not self._folder and not path.exists():
-                self._seen.add(path)
+                self._seen.add(str(path))
                 raise InputError(f"{path}: image not found; check the path.") from error
             trouble = f"cannot be read ({error.strerror})"
         now = self._clock()
@@ -146,7 +167,7 @@ class ImageFiles:
             return data
         self._unfinished[path] = (version, since_s)
         if now - since_s > DAMAGED_AFTER_S:
-            self._seen.add(path)
+            self._seen.add(str(path))
             del self._unfinished[path]
             raise InputError(f"{path}: {trouble}; it is left out.")
         return None

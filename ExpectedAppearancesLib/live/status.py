@@ -32,7 +32,9 @@ class Status:
 
     @property
     def latency_ms(self) -> float | None:
-        return None if self.result is None or self.result.image_rgb is None else self.result.latency_ms
+        if self.result is None or self.result.image_rgb is None or not np.isfinite(self.result.latency_ms):
+            return None
+        return self.result.latency_ms
 
 
 IDLE = Status(Verdict(Sight.IDLE))

@@ -25,6 +25,7 @@ class Alignment:
         self._ras_from_world = RAS_FROM_LPS if case.space == "LPS" else np.eye(4)
         self._start = np.asarray(start, float)
         live_scene.set_pose(self._start)
+        live_scene.is_aligned_by_hand = True
         pivot_ras = transform(self._ras_from_world, case.vessels.centroid_mm[None])[0]
         self.handles = self._scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Manual alignment")
         self.handles.SetAttribute(ROLE_ATTRIBUTE, HANDLES)
@@ -33,6 +34,7 @@ class Alignment:
         display = self.handles.GetDisplayNode()
         if display is not None:
             display.SetAttribute(ROLE_ATTRIBUTE, HANDLES)
+            display.SetSaveWithScene(False)
             display.SetEditorVisibility(True)
             display.SetEditorSliceIntersectionVisibility(False)
             display.SetEditorScalingEnabled(False)
@@ -67,6 +69,7 @@ class Alignment:
             if display is not None and self._scene.IsNodePresent(display):
                 self._scene.RemoveNode(display)
         self._live.set_pose(pose)
+        self._live.is_aligned_by_hand = False
         return pose
 
 

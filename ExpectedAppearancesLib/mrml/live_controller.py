@@ -30,14 +30,16 @@ from . import live_record
 from .live_align import Alignment, pose_of_landmarks
 from .live_drawing import at_once
 from .live_nodes import ROLE_ATTRIBUTE, node_of_role, remove_live_nodes
-from .live_scene import FRAME, LiveScene, OverlayOptions
-from .live_stream import NodeFrames
+from .live_scene import FRAME, PLANE_CHANGE, LiveScene, OverlayOptions
+from .live_stream import NodeFrames, find_volume
 
 
 class Views(Protocol):
     """Whoever shows a LiveScene: told after each change, in the same call, so that nothing is drawn in between."""
 
     def follow(self, live: LiveScene, changed: bool) -> None: ...
+
+    def was_moved(self) -> bool: ...
 
 
 class LiveController:
@@ -237,11 +239,12 @@ class LiveController:
             start = result.prediction.camera_from_world
         if start is None:
             start = self._view_from_above(result.camera)
-        overlay = self._overlays.make(self.live.camera, start)
+        overlay, plane_mm = self._overlays.make(self.live.camera, start), self.live.plane_mm
         if overlay is not None:
             self.live.put_plane_at(overlay.depth_mm)
         self.alignment = Alignment(self.live, self.case, start)
         self.show_truth(start)
+        self._follow(abs(self.live.plane_mm / plane_mm - 1) > PLANE_CHANGE)
         return self.alignment
 
     @at_once
@@ -274,6 +277,7 @@ class LiveController:
         result = self.result
         if result is not None and result.accepted and self.live is not None:
             self.live.set_pose(result.camera_from_world)  # what was predicted is what the views follow
+        self._follow(False)
 
     @at_once
     def show_truth(self, camera_from_world: np.ndarray | None) -> None:
@@ -309,6 +313,24 @@ class LiveController:
         """The browser of what was recorded, or None."""
         recorder, self.recorder = self.recorder, None
         return recorder.finish() if recorder is not None else None
+
+    def look_at(self, browser, case_path: str) -> Status:
+        """`replay`, with the vessels of that case. Without one ('') and where it raises InputError no overlay is left:
+        Slicer goes on to play frames, and that before was not theirs."""
+        try:
+            if case_path:
+                self.open_case(case_path)
+                return self.replay(browser)
+        except InputError:
+            self._look_away()
+            raise
+        self._look_away()
+        return self.status
+
+    def _look_away(self) -> None:
+        self._replayed = None
+        if self.result is not None:
+            self.stop()
 
     @at_once
     def replay(self, browser) -> Status:
@@ -375,7 +397,7 @@ class LiveController:
         estimator = loaded.model.estimator if loaded.model else None
         source = loaded.source
         self._session = LiveSession(
-            self.case, estimator, source.camera, choice.frames, choice.stale_s, self._clock, self._overlays
+            self.case, estimator, source.camera, choice.frame_settings, choice.stale_s, self._clock, self._overlays
         )
         self._session.steady = choice.steady
         self._session.start(source.source, single or source.still)
@@ -405,8 +427,8 @@ class LiveController:
         self.status = self._status(update)
 
     def _node(self, choice: Choice):
-        node = self._scene.GetNodeByID(choice.node_name) or self._scene.GetFirstNodeByName(choice.node_name)
-        if node is None or not node.IsA("vtkMRMLVolumeNode"):
+        node = find_volume(self._scene, choice.node_name)
+        if node is None:
             raise InputError(f"{choice.node_name}: there is no such volume in the scene; choose it again.")
         if node is node_of_role(self._scene, FRAME) or node.GetAttribute(ROLE_ATTRIBUTE):
             raise InputError(
@@ -431,9 +453,10 @@ class LiveController:
             self.views.follow(self.live, changed)
 
     def _follow_models(self) -> None:
-        """The user may move the models, and camera and frame with them, while no new frame comes."""
+        """While no new frame comes the user may move the models, camera and frame with them, or the view."""
         self.live.follow_models()
-        if self.views is not None and not np.array_equal(self.live.camera_to_world, self._seen_from):
+        views = self.views
+        if views and (views.was_moved() or not np.array_equal(self.live.camera_to_world, self._seen_from)):
             self._follow(False)
 
     def _forget_truth(self) -> None:

@@ -5,6 +5,7 @@ All is saved with the scene by Slicer itself. Replaying puts a frame, its transf
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -54,10 +55,11 @@ class Recorder:
         return self.mb >= self._limit_mb
 
     def add(self, result: LiveResult) -> bool:
-        """Append a result that is shown in the live scene. False when it has no picture, or the limit is reached."""
+        """Append a result that is shown in the live scene. False when it has no picture or time, or the limit is
+        reached."""
         from ..registration.predictor import Prediction
 
-        if result.image_rgb is None or self.full:
+        if result.image_rgb is None or not math.isfinite(result.frame.taken_s) or self.full:
             return False
         if self._begin_s is None:
             self._begin_s = result.frame.taken_s
@@ -122,15 +124,12 @@ def pause_playback(scene, but=None) -> None:
             browser.SetPlaybackActive(False)
 
 
-def recorded_frames(browser, pixels: bool = True) -> Iterator[tuple[RecordedFrame, str]]:
-    """Each recorded frame and the key of its case. Raises InputError for a browser that is no recording."""
-    sequences = {role: _sequence(browser, role) for role in (FRAME, NOTE)}
-    for item in range(sequences[NOTE].GetNumberOfDataNodes()):
-        frame, key = from_note(sequences[NOTE].GetNthDataNode(item).GetText())
-        image = None
-        if pixels:
-            image = pixels_of(sequences[FRAME].GetNthDataNode(item).GetImageData())
-        yield replace(frame, image_rgb=image), key
+def recorded_frames(browser) -> Iterator[tuple[RecordedFrame, str]]:
+    """Each recorded frame, without pixels, and the key of its case. Raises InputError for a browser that is no
+    recording."""
+    notes = _sequence(browser, NOTE)
+    for item in range(notes.GetNumberOfDataNodes()):
+        yield from_note(notes.GetNthDataNode(item).GetText())
 
 
 def frame_at(browser) -> tuple[RecordedFrame, str]:
@@ -155,21 +154,38 @@ def put_back(browser, live_scene: LiveScene) -> None:
 
 
 def export(browser, folder: Path, case: Case) -> Path:
-    """Write the frames, poses.json and a transform (.tfm, camera to Slicer's world) of each frame with a pose.
+    """Write the frames, poses.json and a transform (.tfm, camera to Slicer's world) of each frame that had an overlay.
 
-    case: that it was recorded with. Returns the path of poses.json. Raises InputError for a recording of another case,
-    and when it cannot be written.
+    case: that it was recorded with. Returns the path of poses.json. Where the camera changed, as with the size of the
+    frames or of their borders, each camera's frames are in a folder of their own, and `folder` is returned. Raises
+    InputError for a recording of another case, and when it cannot be written.
     """
-    folder, noted = Path(folder), list(recorded_frames(browser, pixels=False))
+    folder, noted = Path(folder), list(recorded_frames(browser))
     if any(key != case_key(case) for _frame, key in noted):
         raise InputError(
             f"{browser.GetName()}: was recorded with the vessels of another case; choose that case, then export."
         )
-    poses_path = export_recording(folder, (frame for frame, _key in recorded_frames(browser)))
-    for number, (frame, _key) in enumerate(noted):
-        pose = frame.camera_from_world
-        if pose is not None:
-            write_transform(folder / "transforms" / f"{number:05d}.tfm", camera_to_ras(pose, case.space))
+    by_camera: dict = {}
+    for item, (frame, _key) in enumerate(noted):
+        by_camera.setdefault(frame.camera, []).append((item, frame))
+    if len(by_camera) <= 1:
+        return _export_part(browser, folder, case, list(enumerate(frame for frame, _key in noted)))
+    for number, part in enumerate(by_camera.values(), 1):
+        _export_part(browser, folder / f"camera_{number}", case, part)
+    return folder
+
+
+def _export_part(browser, folder: Path, case: Case, frames: list[tuple[int, RecordedFrame]]) -> Path:
+    """frames: of one camera, each with its item of the recording."""
+    pictures = _sequence(browser, FRAME)
+    poses_path = export_recording(
+        folder,
+        (replace(frame, image_rgb=pixels_of(pictures.GetNthDataNode(item).GetImageData())) for item, frame in frames),
+    )
+    for number, (_item, frame) in enumerate(frames):
+        if frame.prediction.accepted:  # a file of its own cannot say that it must not be believed
+            matrix = camera_to_ras(frame.camera_from_world, case.space)
+            write_transform(folder / "transforms" / f"{number:05d}.tfm", matrix)
     return poses_path
 
 

@@ -49,6 +49,7 @@ class LiveScene:
         remove_live_nodes(scene, but=(FRAME, TRANSFORM))
         self.options = OverlayOptions()
         self.overlay_visible = False
+        self.is_aligned_by_hand = False  # while it is, the vessels are seen over a frame whose pose was refused, too
         self.camera: Camera | None = None
         self.camera_to_ras = np.eye(4)
         self.plane_mm = FIRST_PLANE_MM
@@ -125,6 +126,7 @@ class LiveScene:
         from vtkmodules.vtkCommonMath import vtkMatrix4x4
 
         self.follow_models()
+        self.frame.SetAndObserveTransformNodeID(self.transform.GetID())  # one that the user removed is made anew
         matrix = vtkMatrix4x4()
         self.frame.GetIJKToRASMatrix(matrix)
         self._stamp = self._newest_change()
@@ -185,6 +187,11 @@ class LiveScene:
             _set_visible(self.frustum, visible)
 
     @property
+    def vessels_visible(self) -> bool:
+        """Whether the vessels themselves may be seen over the frame."""
+        return self.overlay_visible or self.is_aligned_by_hand
+
+    @property
     def fill_opacity(self) -> float:
         """Opacity for the views' label layer: 0 when the overlay is hidden or not wanted."""
         return self.options.fill_opacity if self.overlay_visible and self.options.fill else 0.0
@@ -217,7 +224,7 @@ class LiveScene:
             self._backdrop_of = (self.camera, self.plane_mm)
             behind_mm = self.plane_mm + 3 * self._case.vessels.radius_mm
             self.backdrop.SetAndObservePolyData(_textured_frame(self.camera, behind_mm))
-        _set_visible(self.backdrop, self.overlay_visible)
+        _set_visible(self.backdrop, self.vessels_visible)
 
     def close(self) -> None:
         """Take the live nodes out of the scene; those that a recording plays into stay, hidden overlay aside."""
@@ -237,7 +244,8 @@ class LiveScene:
         if self.frustum is None:
             self.frustum = mark(scenes.add_frustum(self._scene, camera, plane_mm, self.transform), FRUSTUM)
             self.frustum.SetSelectable(False)
-            self.frustum.SetSaveWithScene(False)
+            for node in (self.frustum, self.frustum.GetDisplayNode()):
+                node.SetSaveWithScene(False)
         else:
             scenes.set_frustum(self.frustum, camera, plane_mm)
         return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from ..live.feed import FeedState, FeedStatus
 from ..live.frames import LiveFrame
+from .live_nodes import ROLE_ATTRIBUTE
 
 NODE_CLASSES = ("vtkMRMLVectorVolumeNode", "vtkMRMLStreamingVolumeNode", "vtkMRMLScalarVolumeNode")
 
@@ -26,7 +28,7 @@ class NodeFrames:
         self._number = 0
         self._stamp: tuple | None = None
         self._problem = ""
-        self._attach(node)
+        self._attach(node, -math.inf)  # what it holds may be of yesterday
 
     @property
     def status(self) -> FeedStatus:
@@ -41,22 +43,22 @@ class NodeFrames:
         if self._node is not None and not self._scene.IsNodePresent(self._node):
             self._detach()
         if self._node is None:
-            node = self._scene.GetNodeByID(self._id) or self._scene.GetFirstNodeByName(self._name)
-            if node is not None and node.IsA("vtkMRMLVolumeNode"):
-                self._attach(node)
+            node = find_volume(self._scene, self._id) or find_volume(self._scene, self._name)
+            if node is not None:
+                self._attach(node, self._clock())
         return self.status
 
     def close(self) -> None:
         self._detach()
         self._deliver = lambda _frame: None
 
-    def _attach(self, node) -> None:
+    def _attach(self, node, taken_s: float) -> None:
         self._node, self._id = node, node.GetID()
         events = [node.ImageDataModifiedEvent]
         if hasattr(node, "FrameModifiedEvent"):
             events.append(node.FrameModifiedEvent)
         self._tags = [node.AddObserver(event, self._on_image) for event in events]
-        self._on_image()
+        self._take(taken_s)
 
     def _detach(self) -> None:
         if self._node is not None:
@@ -64,9 +66,15 @@ class NodeFrames:
                 self._node.RemoveObserver(tag)
         self._node = self._tags = self._stamp = None
 
-    def _on_image(self, _caller=None, _event=None) -> None:
-        if hasattr(self._node, "DecodeFrame"):
-            self._node.DecodeFrame()
+    def _on_image(self, _caller, _event) -> None:
+        self._take(self._clock())
+
+    def _take(self, taken_s: float) -> None:
+        compressed = hasattr(self._node, "GetFrame") and self._node.GetFrame() is not None
+        if compressed and not self._node.DecodeFrame():
+            # The node's image is the one before, or nothing, and yet it counts as changed.
+            self._problem = f"The pictures of {self._name} cannot be decoded; check the codec, or send them raw."
+            return
         data = self._node.GetImageData()
         if data is None:
             return
@@ -79,7 +87,21 @@ class NodeFrames:
         self._problem = "" if image is not None else f"The volume {self._name} holds no picture of one slice."
         if image is not None:
             self._number += 1
-            self._deliver(LiveFrame(image, self._clock(), self._number - 1, f"{self._name} {self._number - 1}"))
+            self._deliver(LiveFrame(image, taken_s, self._number - 1, f"{self._name} {self._number - 1}"))
+
+
+def find_volume(scene, id_or_name: str):
+    """The volume of that id, else the first of that name that is not the panel's own; None where there is none.
+
+    Views and connectors may have the same name.
+    """
+    node = scene.GetNodeByID(id_or_name)
+    if node is not None and node.IsA("vtkMRMLVolumeNode"):
+        return node
+    found = scene.GetNodesByClassByName("vtkMRMLVolumeNode", id_or_name)
+    found.UnRegister(None)
+    named = [found.GetItemAsObject(i) for i in range(found.GetNumberOfItems())]
+    return next((node for node in named if not node.GetAttribute(ROLE_ATTRIBUTE)), None)
 
 
 def pixels_of(image_data) -> np.ndarray | None:

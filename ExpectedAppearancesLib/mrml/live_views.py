@@ -58,22 +58,24 @@ def layout_description(with_mri: bool) -> str:
 
 class LiveViews:
     """The views of the live layout. slice_logic: of the view that shows the frame. through_view: gives view node,
-    camera node and size (px) of the view through the camera, or None while there is none; depth_node: gives the MRI's
-    slice, or None. line_view_ids: of the views that outlines are drawn in; () for all."""
+    camera node and size (px) of the view through the camera, or None while there is none; depth_view: gives slice node,
+    composite node and volume's id of the MRI's, or None. line_view_ids: of the views that outlines are drawn in; () for
+    all."""
 
     def __init__(
         self,
         slice_logic,
         through_view: Callable[[], tuple | None],
-        depth_node: Callable[[], object | None] = lambda: None,
+        depth_view: Callable[[], tuple | None] = lambda: None,
         line_view_ids: tuple[str, ...] = (),
     ):
         self._slice, self._composite = slice_logic.GetSliceNode(), slice_logic.GetSliceCompositeNode()
         self._intensity = UnusedIntensity(slice_logic)
-        self._through_view, self._depth_node = through_view, depth_node
+        self._through_view, self._depth_view = through_view, depth_view
         self._line_view_ids = line_view_ids
         self._fitted: tuple | None = None
         self._depth_fitted = None
+        self._aimed: tuple | None = None  # the camera node that looks through the microscope's, and from where
 
     def follow(self, live: LiveScene, changed: bool) -> None:
         """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
@@ -88,15 +90,12 @@ class LiveViews:
         live.show_lines_in(self._line_view_ids)
         show_layers(self._composite, live.frame, live.fill, live.fill_opacity)
         self._intensity.skip()
-        visible = live.overlay_visible
+        visible = live.vessels_visible
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
-        depth = self._depth_node() if visible else None
+        depth = self._depth_view()
         if depth is not None:
-            align_depth_slice(depth, camera_to_world, live.plane_mm)
-            if changed or self._depth_fitted is not depth:
-                self._depth_fitted = depth
-                fit_slice(depth, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
+            self._follow_in_depth(depth, live, camera_to_world, changed)
         through = self._through_view()
         if through is not None:
             view_node, camera_node, view_size_px = through
@@ -105,6 +104,27 @@ class LiveViews:
                 aim_camera(camera_node, view_size_px, live.camera, camera_to_world, live.plane_mm)
             else:
                 look_away(camera_node)
+            self._aimed = (camera_node, _place_of(camera_node)) if visible else None
+
+    def was_moved(self) -> bool:
+        """Whether the user turned or zoomed the view through the camera: from elsewhere the vessels lie on other parts
+        of the picture behind them."""
+        return self._aimed is not None and self._aimed[1] != _place_of(self._aimed[0])
+
+    def _follow_in_depth(self, view: tuple, live: LiveScene, camera_to_world: np.ndarray, changed: bool) -> None:
+        slice_node, composite, volume_id = view
+        visible = live.overlay_visible
+        wanted = volume_id if visible else None
+        if composite.GetBackgroundVolumeID() != wanted:
+            composite.SetBackgroundVolumeID(wanted)
+        if bool(slice_node.GetSliceVisible()) != visible:
+            slice_node.SetSliceVisible(visible)
+        if not visible:
+            return
+        align_depth_slice(slice_node, camera_to_world, live.plane_mm)
+        if changed or self._depth_fitted is not slice_node:
+            self._depth_fitted = slice_node
+            fit_slice(slice_node, live.camera, DEPTH_VIEW_FRAMES * live.plane_mm)
 
     def let_go(self) -> None:
         """The view samples as Slicer does by itself; the layers stay."""
@@ -113,6 +133,7 @@ class LiveViews:
     def leave(self) -> None:
         """Nothing of the live frame stays in the views."""
         self.let_go()
+        self._aimed = None
         self._slice.SetSliceVisible(False)
         for put in (self._composite.SetBackgroundVolumeID, self._composite.SetLabelVolumeID):
             put(None)
@@ -261,6 +282,10 @@ def aim_camera(camera_node, view_size_px: tuple[int, int], camera: Camera, camer
     )
     camera_node.EndModify(was_modifying)
     camera_node.ResetClippingRange()
+
+
+def _place_of(camera_node) -> tuple:
+    return camera_node.GetPosition(), camera_node.GetParallelProjection()
 
 
 def look_away(camera_node) -> None:

@@ -161,7 +161,17 @@ class AlignSection:
         except InputError as error:
             self._say(str(error))
 
+    def _stop_picking(self) -> None:
+        """With its list gone, the next click would put a point into a new one."""
+        logic = slicer.app.applicationLogic()
+        picked_into = logic.GetSelectionNode().GetActivePlaceNodeID()
+        if picked_into in [node.GetID() for node in self._lists]:
+            interaction = logic.GetInteractionNode()
+            interaction.SetCurrentInteractionMode(interaction.ViewTransform)
+
     def _end(self) -> None:
+        if self._lists:
+            self._stop_picking()
         for node in self._lists or ():
             if node.GetScene() is not None:
                 display = node.GetDisplayNode()

@@ -18,7 +18,8 @@ class LayoutSection:
         self._before: int | None = None
         self._banners: list = []
         self._with_mri = False
-        self._overview_fits = False
+        self._mri_id: str | None = None
+        self._overview_of: str | None = None  # the case that the 3D overview shows whole
 
     @property
     def active(self) -> bool:
@@ -49,7 +50,7 @@ class LayoutSection:
             node.SetAxisLabelsVisible(False)
         ids = tuple(node.GetID() for node in (widget.mrmlSliceNode(), *shown_in))
         self.views = live_views.LiveViews(widget.sliceLogic(), self._through, self._depth, ids)
-        self._overview_fits = False
+        self._overview_of = None
         self._restrict_slice(widget.mrmlSliceNode())
         if not self._banners:
             for view in (widget.sliceView(), through.threeDView()):
@@ -78,40 +79,48 @@ class LayoutSection:
         for view, banner in self._banners:
             if banner.say(text, rgb):
                 view.scheduleRender()
-        if self.views is not None and not self._overview_fits and status.new and status.verdict.shows_overlay:
-            self._overview_fits = True
+        shows = self.views is not None and status.new and status.verdict.shows_overlay
+        if shows and status.result.case_key != self._overview_of:
+            self._overview_of = status.result.case_key
             view = self._three_d(live_views.OVERVIEW).threeDView()
             view.resetFocalPoint()
             view.resetCamera()
 
-    def show_mri(self, volume) -> None:
-        """Put a volume into the depth view, and that view into 3D; without a volume there is no such view."""
+    def show_mri(self, volume) -> bool:
+        """The volume for the depth view; without one there is no such view. True when it has come: the views put it up
+        where they follow the frame again."""
         manager = slicer.app.layoutManager()
         if manager is None:
-            return
-        self._with_mri = volume is not None
+            return False
+        wanted_id = volume.GetID() if volume is not None else None
+        has_come = wanted_id not in (None, self._mri_id)
+        self._mri_id, self._with_mri = wanted_id, volume is not None
         layout_node = manager.layoutLogic().GetLayoutNode()
         wanted = live_views.add_layout(layout_node, self._with_mri)
         if layout_node.GetViewArrangement() in self._layout_ids(layout_node) - {wanted}:
             layout_node.SetViewArrangement(wanted)
         widget = manager.sliceWidget(live_views.MRI)
         if widget is None:
-            return
+            return False
         composite = widget.sliceLogic().GetSliceCompositeNode()
-        composite.SetBackgroundVolumeID(volume.GetID() if volume is not None else None)
         composite.SetForegroundVolumeID(None)
         composite.SetLabelVolumeID(None)
-        widget.mrmlSliceNode().SetSliceVisible(volume is not None)
+        if volume is None:
+            composite.SetBackgroundVolumeID(None)
+            widget.mrmlSliceNode().SetSliceVisible(False)
         self._restrict_slice(widget.mrmlSliceNode())
+        return has_come
 
     @staticmethod
     def _layout_ids(layout_node) -> set[int]:
         return {live_views.add_layout(layout_node, with_mri) for with_mri in (False, True)}
 
-    def _depth(self):
-        """The MRI's slice, or None without an MRI."""
+    def _depth(self) -> tuple | None:
+        """Slice node, composite node and the volume's id of the MRI's view, or None without an MRI."""
         widget = slicer.app.layoutManager().sliceWidget(live_views.MRI) if self._with_mri else None
-        return None if widget is None else widget.mrmlSliceNode()
+        if widget is None:
+            return None
+        return widget.mrmlSliceNode(), widget.sliceLogic().GetSliceCompositeNode(), self._mri_id
 
     def _through(self) -> tuple | None:
         """View node, camera node and size of the view through the camera."""

@@ -43,6 +43,7 @@ class LivePanel:
         self._starting = False
         self._missing = live_install.problem()
         self._ticks = 0
+        self._fit_due = False
         self._buttons: tuple | None = None
         self._camera = None
         self.layout = LayoutSection()
@@ -106,6 +107,7 @@ class LivePanel:
         if self._parameter_node is not None:
             self._parameter_node.disconnectGui(self._gui_tag)
         self._parameter_node = parameter_node
+        self._camera = None  # that of a new scene is not known yet
         if parameter_node is not None:
             self._gui_tag = parameter_node.connectGui(self.ui)
             self.refresh()
@@ -130,8 +132,8 @@ class LivePanel:
         options = OverlayOptions(p.outline, p.fill, p.fillOpacity, p.box)
         if options != self.controller.options:
             self.controller.set_options(options)
-        if self.layout.active:
-            self.layout.show_mri(p.mriVolume)
+        if self.layout.active and self.layout.show_mri(p.mriVolume):
+            self._fit_due = True  # Slicer has yet to place the new view
         self._show_problem()
 
     def say(self, text: str, done: bool = False) -> None:
@@ -218,6 +220,9 @@ class LivePanel:
 
     def tick(self) -> None:
         """Called by the timer, on the GUI thread; short, whatever the session does."""
+        if self._fit_due:
+            self._fit_due = False
+            self.fit()
         running = self.controller.running
         self._ticks += 1
         if not running and self._ticks % IDLE_TICKS:

@@ -86,15 +86,14 @@ class RecordSection:
     def _replay(self, browser) -> Status | None:
         p = self._parameters()
         # While a scene is loaded Slicer lets timers run: nodes made then would be mixed up with those that come.
-        if self._controller.running or p is None or not p.casePath or slicer.mrmlScene.IsBatchProcessing():
+        if self._controller.running or p is None or slicer.mrmlScene.IsBatchProcessing():
             return None
         try:
-            self._controller.open_case(p.casePath)
-            return self._controller.replay(browser)
+            return self._controller.look_at(browser, p.casePath)
         except InputError as error:
             self._say(str(error))
             p.browser = None
-            return None
+            return self._controller.status
 
     def _browser(self):
         """The recording that is chosen, if it is one of this panel."""

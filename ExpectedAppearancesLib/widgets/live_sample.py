@@ -8,6 +8,7 @@ import qt
 import slicer
 from slicer.i18n import tr as _
 
+from ..errors import ExpectedAppearancesError
 from ..live.choice import SourceKind
 from .live_panel import LivePanel
 
@@ -38,6 +39,9 @@ def run_sample(panel: LivePanel) -> bool:
         case, frames = make_sample(folder())
     except ImportError as error:
         panel.say(_("The sample needs more than this Slicer has ({error}); install it below.").format(error=error))
+        return False
+    except ExpectedAppearancesError as error:
+        panel.say(str(error))
         return False
     finally:
         slicer.util.showStatusMessage("")

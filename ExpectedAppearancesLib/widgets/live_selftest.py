@@ -106,6 +106,7 @@ def scene_close_and_reload_in_mid_stream_leave_nothing(test) -> None:
         clean = slicer.mrmlScene.GetNumberOfNodes()
         _phantom, widget = started(Path(folder))
         next_result(test, widget)
+        test.assertTrue(widget.panel.parameters().cameraJson)  # of this scene too, to show its frame when it is loaded
         if slicer.app.layoutManager():
             slicer.util.reloadScriptedModule(MODULE)
             test.assertTrue(slicer.util.getModuleWidget(MODULE).panel.layout.active)

@@ -1,0 +1,103 @@
+"""The live panel with stand-ins for Qt and Slicer: what it does with what it is told."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from test_extension import FOLDER, OPEN_THE_PANEL, ROOT
+
+# The stand-ins, without the planning panel that they are opened with there.
+OPEN_THE_LIVE_PANEL = (
+    OPEN_THE_PANEL.split("import ExpectedAppearances as module")[0]
+    + """
+import ExpectedAppearancesLive as module
+from ExpectedAppearancesLib.widgets.live_panel import LivePanel
+
+def parameter_node():
+    node = module.ExpectedAppearancesLiveParameterNode()
+    node.sourceNode = node.mriVolume = node.browser = None
+    node.connectGui = node.disconnectGui = MagicMock()
+    return node
+
+controller = MagicMock(running=False)
+panel = LivePanel(MagicMock(), controller)
+panel.set_parameter_node(parameter_node())
+"""
+)
+
+
+def in_the_panel(code: str, *arguments) -> None:
+    """Run `code` in a fresh interpreter in which `panel` is made; what it asserts must hold."""
+    command = [sys.executable, "-c", OPEN_THE_LIVE_PANEL + code, str(FOLDER), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_camera_of_a_frame_is_remembered_in_each_scene():
+    """A scene does not save where a view's principal point is, so a loaded one could not be shown without it."""
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.geometry.camera import Camera
+controller.camera = Camera(320, 240, 700.0, 690.0, 170.0, 108.0)
+for scene in range(2):
+    panel.set_parameter_node(parameter_node())
+    panel._remember_camera()
+    assert "690.0" in panel.parameters().cameraJson, scene
+    panel.set_parameter_node(None)
+"""
+    )
+
+
+def test_why_the_sample_cannot_be_made_is_said_in_the_panel(tmp_path):
+    in_the_panel(
+        """
+from pathlib import Path
+from ExpectedAppearancesLib.widgets import live_sample
+live_sample.folder = lambda: Path(sys.argv[2]) / "no folder"
+Path(sys.argv[2], "no folder").write_text("")
+assert live_sample.run_sample(panel) is False
+assert "no folder" in panel._message, panel._message
+""",
+        tmp_path,
+    )
+
+
+def test_the_overview_is_laid_out_for_each_case():
+    """Two patients in turn: the second one's head may lie anywhere else."""
+    in_the_panel(
+        """
+from types import SimpleNamespace
+from ExpectedAppearancesLib.live.status import Status
+from ExpectedAppearancesLib.live.trust import Sight, Verdict
+layout = panel.layout
+layout.views, widget = MagicMock(), MagicMock()
+layout._three_d = lambda _name: widget
+for key in ("first", "first", "second"):
+    result = SimpleNamespace(case_key=key, prediction=None)
+    layout.show(Status(Verdict(Sight.FOLLOWING), result, new=True))
+assert widget.threeDView().resetCamera.call_count == 2
+"""
+    )
+
+
+def test_a_landmark_that_was_not_picked_in_the_end_is_not_waited_for():
+    """The next click made a new list of points in the patient's scene."""
+    in_the_panel(
+        """
+slicer.app = MagicMock()
+interaction = slicer.app.applicationLogic().GetInteractionNode()
+selection = slicer.app.applicationLogic().GetSelectionNode()
+panel.align._lists = [MagicMock(), MagicMock()]
+for node, name in zip(panel.align._lists, "FM"):
+    node.GetID.return_value = name
+panel.align._pick(1)
+selection.GetActivePlaceNodeID.return_value = "M"
+interaction.SetCurrentInteractionMode.assert_called_with(interaction.Place)
+panel.align.close()
+interaction.SetCurrentInteractionMode.assert_called_with(interaction.ViewTransform)
+interaction.reset_mock()
+panel.align.close()
+interaction.SetCurrentInteractionMode.assert_not_called()  # the user's own picking goes on
+"""
+    )
