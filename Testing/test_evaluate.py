@@ -191,6 +191,18 @@ def test_prediction_that_lacks_frames_and_truth_without_pose_are_named(case, kno
         evaluate(case, known, tmp_path / "out", predictor=None, predicted_path=tmp_path / "p.json")
 
 
+def test_poses_of_another_case_are_compared_with_nothing(case, known, tmp_path):
+    camera, frames = read_poses(known)
+    entries = [frame.to_dict() for frame in frames]
+    write_poses(tmp_path / "p.json", camera, entries, case.vessels_sha256)
+    evaluate(case, known, tmp_path / "out", predicted_path=tmp_path / "p.json")
+    for path in (known, tmp_path / "p.json"):
+        write_poses(path, camera, entries, "0" * 64)
+    with pytest.raises(InputError) as caught:
+        evaluate(case, known, tmp_path / "out", predicted_path=tmp_path / "p.json")
+    assert len(caught.value.problems) == 2 and all("of another case" in text for text in caught.value.problems)
+
+
 def test_damaged_images_are_all_named(case, known, tmp_path):
     images = [frame.image for frame in read_poses(known)[1]]
     for i in (1, 2):

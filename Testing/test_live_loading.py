@@ -12,12 +12,14 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.demo.phantom import make_phantom
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.live import loading
-from ExpectedAppearancesLib.live.estimator import case_key
+from ExpectedAppearancesLib.live.choice import Choice, SourceKind
+from ExpectedAppearancesLib.live.recording import RecordedFrame, export_recording
 from ExpectedAppearancesLib.live.trust import Sight
+from ExpectedAppearancesLib.registration.predictor import Prediction
 
 slicer = pytest.importorskip("slicer")
 
-from live_cases import choice_of, node_with, shown_pixels, wait_for  # noqa: E402
+from live_cases import SMALL, choice_of, node_with, shown_pixels, wait_for  # noqa: E402
 from mrml_views import new_application  # noqa: E402
 
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
@@ -126,6 +128,19 @@ def test_what_is_wrong_with_the_case_is_said_too(started, phantom, tmp_path):
     assert "camera.json" in wait_for(controller, lambda _s: not controller.loading).problem
 
 
+def test_poses_of_another_case_are_not_drawn_over_their_frames(started, gate, phantom, frames, tmp_path):
+    """They are as sure as that case's own, and this one's vessels would lie anywhere."""
+    controller, _scene, _before = started
+    gate.open.set()
+    for vessels_sha256, problem in (("0" * 64, "of another case"), (phantom.case.vessels_sha256, "")):
+        recorded = RecordedFrame(0.0, "f", SMALL, Prediction(frames[0][0], True, 1.0, 0.0), frames[1][0])
+        path = export_recording(tmp_path / vessels_sha256, [recorded], vessels_sha256)
+        choice = Choice(kind=SourceKind.PATH, path=str(path), case_path=str(phantom.case.folder), stale_s=60)
+        controller.start(choice)
+        assert problem in wait_for(controller, lambda s: s.new or s.problem).problem
+    assert controller.status.result.accepted
+
+
 def test_a_volume_that_goes_while_the_model_is_read_is_waited_for(started, gate, frames):
     controller, scene, _before = started
     scene.RemoveNode(scene.GetFirstNodeByName("Stream"))
@@ -152,5 +167,6 @@ def test_a_case_that_was_made_again_in_its_folder_is_read_again(tmp_path, frames
     make_phantom(tmp_path / "case", seed=1)
     controller.start(choice_of(phantom, stale_s=60))
     status = wait_for(controller, lambda s: s.new or s.problem)
-    assert status.problem == "" and status.result.case_key == case_key(Case.open(tmp_path / "case")) != case_key(first)
+    vessels_sha256 = Case.open(tmp_path / "case").vessels_sha256
+    assert status.problem == "" and status.result.case_key == vessels_sha256 != first.vessels_sha256
     controller.close()

@@ -8,7 +8,6 @@ import pytest
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.demo.phantom import PhantomPainter, covered_frame, make_phantom
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.live.estimator import case_key
 from ExpectedAppearancesLib.live.frames import LiveFrame
 from ExpectedAppearancesLib.live.overlay import OverlayMaker
 from ExpectedAppearancesLib.live.session import LiveResult
@@ -279,7 +278,7 @@ def test_a_refused_pose_is_exported_with_its_refusal_only(application, phantom, 
         pose, image = frames[0][i], frames[1][i]
         overlay = OverlayMaker(phantom.case.vessels).make(SMALL, pose) if accepted else None
         frame, prediction = LiveFrame(image, float(i), i, f"{i}"), Prediction(pose, accepted, 0.5, 1.0)
-        result = LiveResult(frame, case_key(phantom.case), image, SMALL, prediction, overlay)
+        result = LiveResult(frame, phantom.case.vessels_sha256, image, SMALL, prediction, overlay)
         controller.live.show(result)
         recorder = recorder or live_record.Recorder(controller.live)
         assert recorder.add(result)

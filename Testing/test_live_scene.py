@@ -11,7 +11,6 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.geometry.silhouette import Silhouette
-from ExpectedAppearancesLib.live.estimator import case_key
 from ExpectedAppearancesLib.live.frames import LiveFrame
 from ExpectedAppearancesLib.live.overlay import OverlayMaker
 from ExpectedAppearancesLib.live.session import LiveResult
@@ -42,7 +41,7 @@ def result_of(case, pose=POSE, accepted=True, camera=CAMERA, seed=0, taken_s=0.0
     image = np.random.default_rng(seed).integers(60, 120, (camera.height, camera.width, 3), dtype=np.uint8)
     overlay = OverlayMaker(case.vessels).make(camera, pose) if accepted else None
     frame = LiveFrame(image, taken_s, seed, f"frame {seed}")
-    return LiveResult(frame, case_key(case), image, camera, Prediction(pose, accepted, 0.9, 5.0), overlay)
+    return LiveResult(frame, case.vessels_sha256, image, camera, Prediction(pose, accepted, 0.9, 5.0), overlay)
 
 
 def project(points_mm, pose, camera=CAMERA) -> np.ndarray:

@@ -9,7 +9,6 @@ import pytest
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at
-from ExpectedAppearancesLib.live.estimator import case_key
 from ExpectedAppearancesLib.live.frames import LiveFrame
 from ExpectedAppearancesLib.live.overlay import OverlayMaker
 from ExpectedAppearancesLib.live.session import LiveResult
@@ -42,7 +41,7 @@ def result_of(case, accepted=True, seed=0) -> LiveResult:
     image = np.random.default_rng(seed).integers(0, 255, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
     overlay = OverlayMaker(case.vessels).make(CAMERA, POSE) if accepted else None
     prediction = Prediction(POSE, accepted, 0.9, 5.0)
-    return LiveResult(LiveFrame(image, 0.0, seed), case_key(case), image, CAMERA, prediction, overlay)
+    return LiveResult(LiveFrame(image, 0.0, seed), case.vessels_sha256, image, CAMERA, prediction, overlay)
 
 
 @pytest.fixture

@@ -40,6 +40,11 @@ class Case:
         """'LPS' or 'RAS': the axes of the world, which is the mesh files' coordinates."""
         return self.manifest["space"]
 
+    @property
+    def vessels_sha256(self) -> str:
+        """Of the vessels' file: what tells one patient's poses and models from another's."""
+        return self.manifest["inputs"]["vessels"]["sha256"]
+
     @cached_property
     def vessels(self) -> Mesh:
         return read_mesh(self.folder / self.manifest["inputs"]["vessels"]["file"], "vessel mesh")

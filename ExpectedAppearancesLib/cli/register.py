@@ -79,7 +79,7 @@ def run(args, progress) -> None:
         total = max(footage.count, i + 1)
         progress((i + 1) / total, f"frame {i + 1} of {total}")
     problems.raise_if_any()
-    write_poses(args.out, camera, frames)
+    write_poses(args.out, camera, frames, case.vessels_sha256)
     accepted = sum(frame["accepted"] for frame in frames)
     print(f"{accepted} of {len(frames)} frames accepted. Poses: {args.out}")
     if tracker:

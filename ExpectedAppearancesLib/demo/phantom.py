@@ -247,7 +247,7 @@ def _write_model(case: Case) -> None:
         },
         "confidence": confidence.to_dict(),
         "covariance": CovarianceModel(np.diag(np.repeat([ERROR_RAD, ERROR_MM], 3) ** 2), 0.0).to_dict(),
-        "vessels_sha256": case.manifest["inputs"]["vessels"]["sha256"],
+        "vessels_sha256": case.vessels_sha256,
     }
     exposed = exposed_vessels(case.vessels, case.cortex, craniotomy.outward_axis)
     write_vtp(case.model_folder / EXPOSED_VESSELS_NAME, exposed)

@@ -14,7 +14,7 @@ from ..case.case import Case
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera
 from ..registration.footage import FRAME_MARK, is_there
-from ..registration.poses_file import Frame, read_poses, write_poses
+from ..registration.poses_file import Frame, check_vessels, read_poses, write_poses
 from ..registration.record import frame_record
 from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics, reliability
 
@@ -61,9 +61,10 @@ def evaluate(
     with problems.collect():
         check_out(out_folder)
     with problems.collect():
-        camera, true = known_frames(Path(poses_path), styles, case.camera)
+        camera, true = known_frames(Path(poses_path), styles, case)
     if predicted_path is not None:
         with problems.collect():
+            check_vessels(Path(predicted_path), case.vessels_sha256)
             predicted = _pair(true, Path(predicted_path))
     elif predictor is None:
         with problems.collect():
@@ -108,10 +109,12 @@ def check_out(folder: Path) -> None:
     files.require_space(folder, NEEDED_MB)
 
 
-def known_frames(path: Path, styles: Sequence[str] | None, case_camera: Camera) -> tuple[Camera, list[Frame]]:
+def known_frames(path: Path, styles: Sequence[str] | None, case: Case) -> tuple[Camera, list[Frame]]:
     """Camera and frames of the wanted styles, all with a pose and an image. Raises InputError."""
     camera, frames = read_poses(path)
     problems = Problems()
+    with problems.collect():
+        check_vessels(path, case.vessels_sha256)
     if styles:
         known = {frame.style for frame in frames}
         listed = ", ".join(sorted(style for style in known if style is not None)) or "none"
@@ -124,7 +127,7 @@ def known_frames(path: Path, styles: Sequence[str] | None, case_camera: Camera) 
         if not is_there(frame.image):
             problems.add(f"{frame.image}: image not found; {path.name} names it relative to its own folder.")
     problems.raise_if_any()
-    return camera or case_camera, frames
+    return camera or case.camera, frames
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
@@ -171,7 +174,7 @@ def _write(case: Case, evaluation: Evaluation, folder: Path, progress: ProgressF
     from .report import write_report
 
     errors, styles = evaluation.errors, evaluation.styles
-    write_poses(folder / "predicted.json", evaluation.camera, _with_errors(evaluation))
+    write_poses(folder / "predicted.json", evaluation.camera, _with_errors(evaluation), case.vessels_sha256)
     # A copy of the curves' points in numbers: a plot cannot be compared.
     files.write_json(folder / "metrics.json", evaluation.metrics | {"curves": curve_points(errors)})
     progress(0.85, "Drawing the curves")

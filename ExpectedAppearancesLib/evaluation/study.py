@@ -174,7 +174,7 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
     problems, camera, frames = Problems(), case.camera, []
     method, appearances = settings.method, []
     with problems.collect():
-        camera, frames = known_frames(poses_path, None, case.camera)
+        camera, frames = known_frames(poses_path, None, case)
     with problems.collect():
         method, appearances = read_appearances(case, settings.method)
     problems.raise_if_any()
@@ -209,7 +209,7 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
     problems.raise_if_any()
     render = case.manifest["stages"].get("render", {})
     inputs = {
-        "vessels_sha256": case.manifest["inputs"]["vessels"]["sha256"],
+        "vessels_sha256": case.vessels_sha256,
         "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
         "poses_sha256": files.sha256(poses_path),
         # Training draws its poses in these ranges, around the craniotomy.

@@ -36,11 +36,6 @@ class OpenedModel:
     device: str
 
 
-def case_key(case: Case) -> str:
-    """What tells one patient's models from another's: SHA-256 of the vessels."""
-    return case.manifest["inputs"]["vessels"]["sha256"]
-
-
 def open_model(case: Case) -> OpenedModel:
     """The case's model, warmed up. Raises InputError when it is missing, damaged, or was trained on other vessels."""
     try:

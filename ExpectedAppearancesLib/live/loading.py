@@ -6,9 +6,11 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from ..case.case import Case
 from ..errors import ExpectedAppearancesError
+from ..registration.poses_file import check_vessels
 from .choice import Choice, OpenedSource, open_source
 from .estimator import OpenedModel, open_model
 from .overlay import OverlayMaker
@@ -31,6 +33,8 @@ def load(
     """Read what was chosen, but for what is given. Raises InputError with what is wrong."""
     opened = Case.open(choice.case_path)
     source = open_source(choice, opened.camera)
+    if not choice.needs_model:
+        check_vessels(Path(choice.path), opened.vessels_sha256)
     if case is None or overlays is None or _inputs(opened) != _inputs(case):  # made again in the same folder
         case = opened
         case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now

@@ -91,8 +91,10 @@ def from_note(text: str) -> tuple[RecordedFrame, str]:
         raise InputError(f"recorded frame: its note cannot be read ({error}); record again.") from error
 
 
-def export_recording(folder: Path, frames: Iterable[RecordedFrame]) -> Path:
+def export_recording(folder: Path, frames: Iterable[RecordedFrame], vessels_sha256: str | None = None) -> Path:
     """Write frames/NNNNN.png and poses.json into `folder`; returns the path of poses.json, written last.
+
+    vessels_sha256: of the case that they were registered to.
 
     Raises InputError when there is no frame, when the camera changes (one poses.json has one camera), or on a full
     disk.
@@ -116,7 +118,7 @@ def export_recording(folder: Path, frames: Iterable[RecordedFrame]) -> Path:
         entries.append(entry | {"confidence": _known(frame.prediction.confidence)})
     if not entries:
         raise InputError("recording: there is no frame to export; record some first.")
-    write_poses(folder / "poses.json", camera, entries)
+    write_poses(folder / "poses.json", camera, entries, vessels_sha256)
     return folder / "poses.json"
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from ..case.case import Case
 from ..errors import ExpectedAppearancesError
 from ..geometry.camera import Camera
-from .estimator import Estimator, case_key
+from .estimator import Estimator
 from .feed import Feed, FeedState, FeedStatus
 from .frames import FramePreparation, FrameSettings, LiveFrame
 from .overlay import Overlay, OverlayMaker
@@ -105,7 +105,7 @@ class LiveSession:
         clock: Callable[[], float] = time.monotonic,
         overlays: OverlayMaker | None = None,
     ):
-        self.case_key = case_key(case)
+        self.case_key = case.vessels_sha256
         self.stale_s, self.steady = stale_s, False
         self._clock, self._estimator = clock, estimator
         self._steadying: Steadying | None = None

@@ -270,7 +270,7 @@ class _Trainer:
             "confidence": confidence.to_dict(),
             "covariance": covariance.to_dict(),
             "validation": figures,
-            "vessels_sha256": self.case.manifest["inputs"]["vessels"]["sha256"],
+            "vessels_sha256": self.case.vessels_sha256,
         }
         files.write_json(self.folder / "training.json", {"curve": self.state["curve"], "validation": figures})
         write_vtp(self.folder / EXPOSED_VESSELS_NAME, self.exposed)

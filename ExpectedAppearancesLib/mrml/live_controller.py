@@ -16,7 +16,7 @@ from ..geometry.camera import Camera
 from ..geometry.pose import look_at
 from ..live.alignment import PoseDifference, compare, nudge_between, nudged
 from ..live.choice import Choice, SourceKind
-from ..live.estimator import OpenedModel, case_key
+from ..live.estimator import OpenedModel
 from ..live.frames import LiveFrame
 from ..live.loading import Loaded, Loading, load
 from ..live.overlay import OverlayMaker
@@ -345,7 +345,7 @@ class LiveController:
         live_record.pause_playback(self._scene, but=browser)
         frame, recorded_key = live_record.frame_at(browser)
         verdict = Verdict(Sight.FROZEN if frame.prediction.accepted else Sight.REFUSED)
-        if recorded_key != case_key(self.case):
+        if recorded_key != self.case.vessels_sha256:
             verdict = Verdict(Sight.OTHER_CASE)
         live_record.put_back(browser, self.live)
         changed = self.live.take_replayed(frame.camera)

@@ -15,7 +15,6 @@ import numpy as np
 from ..case.case import Case
 from ..errors import InputError
 from ..geometry.pose import camera_to_ras
-from ..live.estimator import case_key
 from ..live.recording import RecordedFrame, export_recording, from_note, to_note
 from ..live.session import LiveResult
 from . import scene as scenes
@@ -161,7 +160,7 @@ def export(browser, folder: Path, case: Case) -> Path:
     InputError for a recording of another case, and when it cannot be written.
     """
     folder, noted = Path(folder), list(recorded_frames(browser))
-    if any(key != case_key(case) for _frame, key in noted):
+    if any(key != case.vessels_sha256 for _frame, key in noted):
         raise InputError(
             f"{browser.GetName()}: was recorded with the vessels of another case; choose that case, then export."
         )
@@ -181,6 +180,7 @@ def _export_part(browser, folder: Path, case: Case, frames: list[tuple[int, Reco
     poses_path = export_recording(
         folder,
         (replace(frame, image_rgb=pixels_of(pictures.GetNthDataNode(item).GetImageData())) for item, frame in frames),
+        case.vessels_sha256,
     )
     for number, (_item, frame) in enumerate(frames):
         if frame.prediction.accepted:  # a file of its own cannot say that it must not be believed

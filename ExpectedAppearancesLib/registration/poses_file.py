@@ -1,7 +1,8 @@
 """poses.json: frames and their poses, in and out.
 
 {"camera": {...} or the path of a camera file, "frames": [{"image", "camera_from_world", "style", ...}]}; OpenCV axes,
-mm, world = the mesh files' coordinates. Paths are relative to the poses file that names them.
+mm, world = the mesh files' coordinates. Paths are relative to the poses file that names them. "vessels_sha256", where
+it is there, names the case that the poses were registered to.
 """
 
 from __future__ import annotations
@@ -65,10 +66,24 @@ def read_poses(path: Path) -> tuple[Camera | None, list[Frame]]:
     return camera, frames
 
 
-def write_poses(path: Path, camera: Camera | None, frames: Iterable[Mapping]) -> None:
+def check_vessels(path: Path, vessels_sha256: str) -> None:
+    """Raise InputError where the poses file names the vessels of another case than those with this digest."""
+    values = files.read_json(Path(path), "poses file")
+    named = values.get("vessels_sha256") if isinstance(values, dict) else None
+    if named not in (None, vessels_sha256):
+        raise InputError(
+            f"{path}: its poses are of another case, whose vessels they were registered to; choose that case, or "
+            "register the frames to this one."
+        )
+
+
+def write_poses(
+    path: Path, camera: Camera | None, frames: Iterable[Mapping], vessels_sha256: str | None = None
+) -> None:
     """Write frames, each a dict with image (path), camera_from_world (4x4 or None) and any JSON values.
 
-    Images are written relative to the file, with forward slashes; on another drive, absolute. Raises InputError.
+    Images are written relative to the file, with forward slashes; on another drive, absolute. vessels_sha256: of the
+    case that the frames were registered to. Raises InputError.
     """
     path = Path(path).absolute()
     entries = []
@@ -77,6 +92,7 @@ def write_poses(path: Path, camera: Camera | None, frames: Iterable[Mapping]) ->
         pose = None if pose is None else np.asarray(pose, float).tolist()
         entries.append(dict(frame) | {"image": _relative(frame["image"], path.parent), "camera_from_world": pose})
     value = {"camera": camera.to_dict()} if camera else {}
+    value |= {"vessels_sha256": vessels_sha256} if vessels_sha256 else {}
     convention = "camera_from_world maps world mm to camera mm; camera axes x right, y down, z forward (OpenCV)"
     files.write_json(path, value | {"convention": convention, "frames": entries})
 

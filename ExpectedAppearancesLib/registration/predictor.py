@@ -147,7 +147,7 @@ def open_predictor(case: Case, threads: int = 2) -> Predictor:
     """The case's own. Raises InputError where its model is missing or damaged, or was trained on other vessels."""
     predictor = Predictor(case.model_folder, threads)
     trained_on = predictor.meta.get("vessels_sha256")
-    if trained_on and trained_on != case.manifest["inputs"]["vessels"]["sha256"]:
+    if trained_on and trained_on != case.vessels_sha256:
         raise InputError(
             f"{case.model_folder}: this model was trained on the vessels of another case; train this case, or open "
             "the case that the model belongs to."
