@@ -278,3 +278,44 @@ validation._show_hint(2)
 assert "begins anew" in panel.ui.studyHint.text
 """
     )
+
+
+def test_another_preset_or_method_brings_its_time_or_size_at_once():
+    """Slicer binds parameters to widgets after the panel was set up: who is told of a choice first is the panel, and
+    every parameter that is set puts all widgets back to what the parameters say."""
+    in_the_panel(
+        """
+class Bound(module.ExpectedAppearancesParameterNode):
+    box = None
+    def __setattr__(self, name, value):
+        object.__setattr__(self, name, value)
+        self.box and self.show()
+    def show(self):
+        choose(self.box, list(type(getattr(self, self.box))).index(getattr(self, self.box)))
+
+def choose(box, index):
+    if shown[box] != index:
+        shown[box] = index
+        heard[box](index)
+        setattr(p, box, list(type(getattr(p, box)))[shown[box]])
+
+shown = {"preset": 0, "method": 0}
+heard = {"preset": panel.sections["training"].on_preset, "method": panel.sections["appearances"].on_method}
+p = panel.parameters = Bound()
+for box, name, index, value in (
+    ("preset", "minutes", 1, 90.0),
+    ("preset", "minutes", 2, 720.0),
+    ("preset", "minutes", 0, 26.0),
+    ("method", "sizePx", 1, 256),
+    ("method", "sizePx", 0, 384),
+):
+    p.box = box
+    choose(box, index)
+    assert shown[box] == index and getattr(p, name) == value, (box, shown, getattr(p, name))
+for box, name in (("preset", "minutes"), ("method", "sizePx")):
+    p.box = box
+    setattr(p, name, 111)
+    choose(box, 1)
+    assert getattr(p, name) == 111  # what the user has set
+"""
+    )

@@ -28,7 +28,6 @@ class TrainingSection(Section):
         self._asked = None
         self._live: list[dict] = []  # told by the run since its last checkpoint
         self._plotted: tuple | None = None
-        self._preset: str | None = None
         self.controls = RunControls(
             self.panel.runs["train"],
             ui.trainingStart,
@@ -96,14 +95,17 @@ class TrainingSection(Section):
         options = ["--preset", p.preset.value, "--minutes", f"{p.minutes:g}", "--appearances", p.method.value]
         return [*options, *device], environment
 
-    def on_preset(self, _index: int) -> None:
+    def on_preset(self, index: int) -> None:
         """Each preset has a time of its own, which is taken over where the time was that of the preset before."""
         p = self.parameters
-        if p is None or self.panel.loading or self._preset == p.preset.value:
+        if p is None or self.panel.loading or index < 0:
             return
-        if self._preset is not None and math.isclose(p.minutes, PRESETS[self._preset].minutes):
-            p.minutes = PRESETS[p.preset.value].minutes
-        self._preset = p.preset.value
+        before, chosen = p.preset, list(type(p.preset))[index]
+        # Set here: its box is bound to it later than to this, and to set the time before would undo the choice.
+        if not changed(p, "preset", chosen):
+            return
+        if math.isclose(p.minutes, PRESETS[before.value].minutes):
+            p.minutes = PRESETS[chosen.value].minutes
 
     def on_device(self, index: int) -> None:
         keys = self._device_keys()
