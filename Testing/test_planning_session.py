@@ -27,7 +27,7 @@ from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import mri, planning, planning_session  # noqa: E402
 from ExpectedAppearancesLib.mrml.planning_adopt import adopt, adopting  # noqa: E402
-from ExpectedAppearancesLib.mrml.segment_surface import SegmentSurfaces  # noqa: E402
+from ExpectedAppearancesLib.mrml.segment_surface import SegmentSurfaces, answering  # noqa: E402
 
 
 def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
@@ -384,6 +384,48 @@ def test_the_surface_of_a_segment_comes_from_a_process_and_an_outdated_one_never
         )
     finally:
         worker.stop()
+
+
+def test_a_segment_is_taken_with_the_smoothing_that_is_set_for_its_surface(scene, planned, tmp_path):
+    """In the Segment Editor's menu of Show 3D: thin vessels vanish where they are smoothed much."""
+    session, p = planned
+    image = slicer.vtkOrientedImageData()
+    image.SetExtent(0, 19, 0, 19, 0, 19)
+    image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
+    voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(20, 20, 20)
+    voxels[:] = 0
+    voxels[3:17, 9:11, 9:11] = 1
+    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "S")
+    p.vesselsSegmentId = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
+    p.vesselsNode, segmentation = node, node.GetSegmentation()
+
+    def width_mm() -> float:
+        return np.ptp(session.mesh(p, "vessels").vertices_mm[:, 0])
+
+    def smooth(factor: float, shown: bool) -> None:
+        segmentation.SetConversionParameter("Smoothing factor", str(factor))
+        if shown:
+            segmentation.CreateRepresentation("Closed surface", True)
+
+    usual = width_mm()
+    smooth(0.5, shown=True)
+    assert width_mm() == pytest.approx(usual, abs=1e-3)
+    smooth(0.0, shown=True)
+    sharp = width_mm()
+    assert sharp > usual + 0.1
+    segmentation.RemoveRepresentation("Closed surface")
+    assert width_mm() == pytest.approx(sharp, abs=1e-3)
+    smooth(0.5, shown=False)
+    assert width_mm() == pytest.approx(usual, abs=1e-3)
+    smooth(0.0, shown=False)
+    asked: list[dict] = []
+    surfaces = SegmentSurfaces(asked.append)
+    list(surfaces.asking(node, p.vesselsSegmentId, tmp_path))
+    surfaces.take(asked[0], {"answer": answering()(asked[0])})
+    made = surfaces.made(node, p.vesselsSegmentId)
+    assert np.ptp(made.vertices_mm[:, 0]) == pytest.approx(sharp, abs=1e-3)
+    smooth(0.5, shown=False)
+    assert surfaces.to_ask(node, p.vesselsSegmentId)
 
 
 def test_the_session_loads_nothing_heavy():

@@ -20,7 +20,7 @@ from ..poses.craniotomy import Craniotomy, find_craniotomy, has_own_axis
 from ..poses.sampling import PoseRanges, PoseSampler
 from ..textures.library import list_textures, names_taken_twice, shipped_textures_folder
 from . import mri, planning
-from .segment_surface import SegmentSurfaces, voxels_version
+from .segment_surface import SegmentSurfaces, segment_version
 
 SURFACE_WAITING = "The surface of the segment is being made."
 MODELS = {"vessels": "vessel model", "cortex": "cortex model"}
@@ -377,7 +377,7 @@ def _version_of(node, segment_id: str = "") -> tuple:
     """Changes with the node's content and with the transforms above it."""
     moved = _moved(node)
     if node.IsA("vtkMRMLSegmentationNode"):
-        return (voxels_version(node, segment_id), moved)
+        return (segment_version(node, segment_id), moved)
     if node.IsA("vtkMRMLModelNode"):
         return (node.GetPolyData().GetMTime() if node.GetPolyData() else 0, moved)
     raise ValueError(f"{node.GetClassName()}: neither model nor segmentation")
