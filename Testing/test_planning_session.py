@@ -215,6 +215,21 @@ def test_a_case_is_opened_with_the_textures_it_was_made_with(scene, planned, tmp
     assert other.texturesPath == str(case.folder / "textures")
 
 
+def test_everything_on_a_network_drive_that_is_lost_is_told_as_gone(scene, planned, tmp_path, vanish):
+    """The panel asks at every change; what it is told must be an answer, not an error of the system."""
+    session, p = planned
+    case = save(session, p, tmp_path)
+    (case.folder / "textures").mkdir()
+    p.casePath, p.texturesPath = str(case.folder), str(case.folder / "textures")
+    assert session.steps(p)["case"].state is StepState.DONE
+    vanish(tmp_path)
+    for calibration in ("camera.json", "camera.yml"):
+        p.calibrationPath = str(case.folder / calibration)
+        steps = session.steps(p)
+        assert "Connect its drive" in steps["case"].text and "not found" in steps["microscope"].text
+        assert "no longer there" in steps["textures"].text and session.texture_files(p) == {}
+
+
 def test_microscope_from_its_field_of_view(planned):
     session, p = planned
     p.cameraSource = Source.VIEW

@@ -212,6 +212,15 @@ def test_a_run_that_is_killed_by_the_system_leaves_nothing_behind(case):
     assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in tree)
 
 
+def test_the_end_of_a_run_is_seen_although_its_drive_is_gone(case, vanish):
+    run = start(case, "wait")
+    wait_until_ready(case, run)
+    run._tree.kill()
+    vanish(case.parent)
+    assert run.wait(DEADLINE_S).state is RunState.FAILED
+    assert Run.find(case, "synthesize") is None
+
+
 def test_a_second_run_of_the_kind_is_refused_while_one_goes_on(case):
     run = start(case, "wait")
     with pytest.raises(InputError, match=rf"going on .*{run._record.pid}"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -32,9 +33,10 @@ class CaseReader:
     def case(self, folder: str) -> tuple[Case | None, str]:
         """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
         path = Path(folder) / MANIFEST_NAME
-        if not folder or not path.is_file():
+        if not folder or not os.path.isfile(path):  # unlike pathlib's, False on a network drive that is gone
             # A scene from another computer, a drive taken away, or a case that was here a moment ago.
-            gone = folder and (not path.parent.parent.is_dir() or (self._case and self._case.folder == path.parent))
+            known = self._case and self._case.folder == path.parent
+            gone = folder and (known or not os.path.isdir(path.parent.parent))
             text = f"{folder}: is not there. Connect its drive, open the case where it is now, or choose New."
             return None, text if gone else ""
         case, problem = self._once(path, self._open)

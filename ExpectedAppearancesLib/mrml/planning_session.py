@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -80,7 +81,7 @@ class PlanningSession:
         if not parameters.calibrationPath:
             raise InputError("Choose a calibration file, or give the field of view.")
         path = Path(parameters.calibrationPath)
-        version = (str(path), path.stat().st_mtime_ns if path.is_file() else None)
+        version = (str(path), path.stat().st_mtime_ns if os.path.isfile(path) else None)
         try:
             return self._once("camera", version, lambda: read_camera(path))
         except ImportError as error:
@@ -339,7 +340,7 @@ class PlanningSession:
 
     def _textures(self, parameters) -> tuple[dict[str, str], str]:
         folder = self.textures_folder(parameters)
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             return {}, f"{folder}: is no longer there; choose another folder."
         found = self.texture_files(parameters)
         bad = [self.texture_problems[version] for version, *_ in found.values() if version in self.texture_problems]

@@ -57,7 +57,7 @@ def record_path(case_folder: Path, kind: str) -> Path:
 def read_record(case_folder: Path, kind: str) -> RunRecord | None:
     """The newest run of this kind that was started on this computer; None where there is none that can be read."""
     path = record_path(case_folder, kind)
-    if not path.is_file():
+    if not os.path.isfile(path):
         return None
     try:
         content = files.read_json(path, "record of a run")
