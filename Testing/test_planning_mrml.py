@@ -11,6 +11,7 @@ import pytest
 
 from ExpectedAppearancesLib.case.meshes import read_mesh
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.evaluation.verdict import Figures
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
@@ -234,6 +235,12 @@ def test_plots_are_found_again_and_filled_anew(scene):
     series = {chart.GetNthPlotSeriesNode(i).GetName(): chart.GetNthPlotSeriesNode(i) for i in range(2)}
     rows = {name: node.GetTableNode().GetNumberOfRows() for name, node in series.items()}
     assert rows == {"Validation ADD (mm)": 2, "Loss": 2}
+    charts.show_training(scene, [])
+    assert [series[name].GetTableNode().GetNumberOfRows() for name in rows] == [0, 0]
+    table, chart = charts.show_figures(scene, [Figures("strict", "a", *[1.0] * 6)], 3.0)
+    assert (table.GetNumberOfRows(), chart.GetNumberOfPlotSeriesNodes()) == (1, 1)
+    assert charts.show_figures(scene, [], 3.0) == (table, chart)
+    assert (table.GetNumberOfRows(), chart.GetNumberOfPlotSeriesNodes()) == (0, 0)
 
 
 KEEP_THE_CONTEXT = """

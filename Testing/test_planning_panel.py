@@ -319,3 +319,38 @@ for box, name in (("preset", "minutes"), ("method", "sizePx")):
     assert getattr(p, name) == 111  # what the user has set
 """
     )
+
+
+def test_plots_and_table_of_a_case_do_not_stay_for_the_next_one():
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.mrml import charts
+from ExpectedAppearancesLib.widgets import planning_training
+training, validation, p = panel.sections["training"], panel.sections["validation"], panel.parameters
+drawn = {}
+charts.chart_of = charts.table_of = lambda *_: bool(drawn)
+charts.show_training = lambda scene, curve: drawn.update(loss=curve)
+charts.show_figures = lambda scene, rows, limit: drawn.update(figures=rows, limit=limit) or (MagicMock(), MagicMock())
+of_case = {"first": [{"step": 5}], "second": [{"step": 5}], "new": []}
+training._curve = lambda case: of_case[p.casePath]
+validation._rows = lambda: of_case[p.casePath]
+validation._verdict = lambda rows: ""
+p.casePath = "new"
+drawn = {"loss": "saved with the scene", "figures": "saved with the scene"}
+panel.open_folder("new")
+assert drawn["loss"] == drawn["figures"] == "saved with the scene"
+for folder in ("first", "new", "second"):
+    panel.open_folder(folder)
+    assert drawn["loss"] is drawn["figures"] is of_case[folder], (folder, drawn)
+training.on_show_loss()
+validation.on_show()
+panel.open_folder("new")
+assert drawn["loss"] == drawn["figures"] == []
+p.addLimitMm = 2.0
+panel.open_folder("first")
+assert drawn["limit"] == 2.0
+p.addLimitMm = 1.5
+panel.refresh()
+assert drawn["limit"] == 1.5
+"""
+    )

@@ -128,7 +128,7 @@ class PlanningPanel:
             return
         if self._followed != self.parameters.casePath:
             self._followed = self.parameters.casePath
-            self.sections["training"].close()  # forgets what the run of the case before has told
+            self.sections["training"].forget_run()
             for watch in self.runs.values():
                 watch.follow(self._followed)
         if not self.entered:
