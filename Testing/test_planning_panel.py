@@ -354,3 +354,37 @@ panel.refresh()
 assert drawn["limit"] == 1.5
 """
     )
+
+
+def test_the_slice_view_looked_through_shows_the_scan_that_was_chosen_meanwhile_afterwards():
+    """Another case is opened while the box is ticked: its scan must not give way to that of the patient before."""
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.widgets.planning_look import planning
+before = {"BackgroundVolumeID": "MRI of the first", "ForegroundVolumeID": None, "LabelVolumeID": None}
+before["LabelOpacity"] = 0.5
+shown, composite, slice_node = dict(before), MagicMock(), MagicMock()
+for name in shown:
+    getattr(composite, "Get" + name).side_effect = lambda n=name: shown[n]
+    getattr(composite, "Set" + name).side_effect = lambda value, n=name: shown.update({n: value})
+slice_node.GetFieldOfView.return_value = (1.0, 1.0, 1.0)
+composite.GetID.return_value, slice_node.GetID.return_value = "Composite", "Slice"
+panel.scene.GetNodeByID = lambda name: composite if "Composite" in name else slice_node
+planning.look_at_mask = MagicMock()
+looking, mask = panel.sections["poses"]._looking, MagicMock(GetID=lambda: "mask")
+
+def look():
+    looking._show_slice(mask, None, None, 1.0, "LPS")
+    assert list(shown.values()) == [None, None, "mask", 1.0]
+
+for chosen in (None, "MRI of the second"):
+    for once_more in (False, True):
+        shown.update(before)
+        look()
+        shown["BackgroundVolumeID"] = chosen
+        if once_more:
+            look()
+        list(looking._take_away())
+        assert shown == before | ({"BackgroundVolumeID": chosen} if chosen else {}), shown
+"""
+    )

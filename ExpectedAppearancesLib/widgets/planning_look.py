@@ -121,6 +121,7 @@ class Looking:
             return
         if self._slice_before is None:
             self._slice_before = _SliceBefore(slice_node, composite)
+        self._slice_before.notice(composite)
         planning.look_at_mask(slice_node, camera, pose, plane_mm, space)
         modifying = composite.StartModify()
         composite.SetBackgroundVolumeID(None)
@@ -165,10 +166,17 @@ class _SliceBefore:
             composite.GetLabelOpacity(),
         )
 
+    def notice(self, composite) -> None:
+        """What was put behind the label map meanwhile, such as the MRI of a case that was opened, stays afterwards."""
+        shown = composite.GetBackgroundVolumeID(), composite.GetForegroundVolumeID()
+        if any(shown):
+            self._volumes = (*shown, *self._volumes[2:])
+
     def restore(self, scene) -> None:
         slice_node, composite = scene.GetNodeByID(self._slice_id), scene.GetNodeByID(self._composite_id)
         if slice_node is None or composite is None:
             return
+        self.notice(composite)
         slice_node.GetSliceToRAS().DeepCopy(self._to_ras)
         slice_node.UpdateMatrices()
         slice_node.SetFieldOfView(*self._field_of_view)
