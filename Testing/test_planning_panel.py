@@ -164,6 +164,34 @@ assert len(list(folder.parent.iterdir())) == 2, list(folder.parent.iterdir())
     )
 
 
+def test_a_case_that_another_program_works_on_is_neither_replaced_nor_worked_on(tmp_path):
+    """A training that a second Slicer or a shell has started would write its model into the new case."""
+    in_the_panel(
+        SAVED_ANEW
+        + """
+from ExpectedAppearancesLib.runs.record import exclusive
+from ExpectedAppearancesLib.widgets import planning_run
+save("1")
+started = []
+panel.runs["synthesize"].start = lambda *_arguments: started.append("synthesize")
+panel.session.case = lambda p: None
+with exclusive(folder, "train"):
+    save("2")
+    assert "a training is going on" in told.errorDisplay.call_args.args[0]
+    told.errorDisplay.reset_mock()
+    sys.modules["slicer"].util = told
+    assert not planning_run.started(panel, panel.runs["synthesize"], []) and not started
+    assert "a training is going on" in told.errorDisplay.call_args.args[0]
+assert (folder / "case.json").read_text() == "1"
+assert not made.exists()
+assert planning_run.started(panel, panel.runs["synthesize"], []) and started
+save("3")
+assert (folder / "case.json").read_text() == "3"
+""",
+        tmp_path / "case",
+    )
+
+
 def test_a_case_that_was_opened_while_another_one_was_saved_stays_open(tmp_path):
     in_the_panel(
         SAVED_ANEW

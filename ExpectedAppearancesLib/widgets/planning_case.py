@@ -18,6 +18,7 @@ from ..case.case import MANIFEST_NAME
 from ..case.steps import StepState
 from ..errors import InputError
 from ..mrml.mri import keeping_scan
+from ..runs.record import refuse_if_occupied
 from .planning_qt import Child, Stepper, allow, library_command, problems_in, quiet
 from .planning_section import NodeWatch, Section, changed
 
@@ -209,6 +210,7 @@ class CaseSection(Section):
     def _put_in_place(self, made: Path, folder: Path) -> None:
         try:
             if made != folder:
+                refuse_if_occupied(folder)  # what goes on there would write into the new case
                 if (folder / OWN_TEXTURES).is_dir():
                     shutil.copytree(folder / OWN_TEXTURES, made / OWN_TEXTURES)
                 kept = _kept_name(folder)
@@ -227,6 +229,10 @@ class CaseSection(Section):
                     )
                 ]
             )
+            return
+        except InputError as error:
+            shutil.rmtree(made, ignore_errors=True)
+            self._tell(error.problems)
             return
         if Path(self.parameters.casePath) == folder:  # else another case was opened meanwhile
             self.panel.open_folder(str(folder))
