@@ -416,3 +416,27 @@ for chosen in (None, "MRI of the second"):
         assert shown == before | ({"BackgroundVolumeID": chosen} if chosen else {}), shown
 """
     )
+
+
+def test_an_appearance_that_is_made_again_is_shown_anew(tmp_path):
+    """After its texture was corrected, or in a case that was saved anew: it has the name of the old one."""
+    in_the_panel(
+        """
+import os
+from pathlib import Path
+from ExpectedAppearancesLib.widgets import planning_appearances
+planning_appearances.qt = MagicMock()
+planning_appearances.qt.QPixmap.return_value.isNull.return_value = False
+picture, appearances = Path(sys.argv[2]) / "apricot-0.png", panel.sections["appearances"]
+panel.session.reader.newest_image = lambda case, method: (picture, 1) if picture.is_file() else (picture, 0)
+panel.session.case = lambda p: MagicMock()
+for made_at, shown in ((1, 1), (1, 1), (2, 2), (None, 2), (3, 3)):
+    picture.unlink(missing_ok=True)
+    if made_at:
+        picture.touch()
+        os.utime(picture, (made_at, made_at))
+    appearances._show_newest(panel.parameters)
+    assert panel.ui.newestImage.setPixmap.call_count == shown, (made_at, panel.ui.newestImage.setPixmap.call_count)
+""",
+        tmp_path,
+    )

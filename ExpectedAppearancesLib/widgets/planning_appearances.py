@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import qt
 from slicer.i18n import tr as _
 
@@ -75,9 +77,12 @@ class AppearancesSection(Section):
         case = self.session.case(p)
         path, count = self.session.reader.newest_image(case, p.method.value) if case else (None, 0)
         self.ui.newestImage.visible = path is not None
-        if path is None or (path, count) == self._shown:
+        if path is None or not os.path.isfile(path):
             return
-        self._shown = (path, count)
+        version = (path, count, os.path.getmtime(path))  # one that is made again has the name of the old one
+        if version == self._shown:
+            return
+        self._shown = version
         picture = qt.QPixmap(str(path))
         if picture.isNull():
             return
