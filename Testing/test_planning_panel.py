@@ -440,3 +440,21 @@ for made_at, shown in ((1, 1), (1, 1), (2, 2), (None, 2), (3, 3)):
 """,
         tmp_path,
     )
+
+
+def test_what_is_enabled_says_what_it_is():
+    """The reason why it was disabled takes the place of its tool tip."""
+    in_the_panel(
+        """
+panel.session.sampler, panel.help.reason = lambda p: MagicMock(), lambda kind: ""
+panel.sections["poses"]._show_automatic = panel.sections["poses"]._refresh_cameras = lambda *_: None
+panel.sections["poses"]._looking = MagicMock()
+p, ui = panel.parameters, panel.ui
+for automatic in (True, False):
+    p.distanceAuto = p.lateralAuto = automatic
+    p.lookThrough = not automatic
+    panel.refresh()
+    for widget in (ui.nearestSlider, ui.farthestSlider, ui.lateralSlider, ui.poseSlider):
+        assert widget.enabled is not automatic and isinstance(widget.toolTip, str) and widget.toolTip
+"""
+    )
