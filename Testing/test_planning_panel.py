@@ -243,6 +243,10 @@ panel.recorded = Recorded(verdict=(True, ()))
 loto, own, strict = (Figures(name, "", *[1.0] * 6) for name in ("loto", OWN_VALIDATION, "strict"))
 for rows, words in (([loto, own], "own validation"), ([strict, loto, own], "unseen texture and pose")):
     assert words in panel.sections["validation"]._verdict(rows), panel.sections["validation"]._verdict(rows)
+    assert ">Ready<" in panel.sections["validation"]._verdict(rows)
+panel.recorded = Recorded(verdict=(True, ()), validation="stale")
+text = panel.sections["validation"]._verdict(rows)
+assert "Outdated" in text and ">Ready<" not in text
 """
     )
 

@@ -329,6 +329,14 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     assert "SHA-256" in reader.recorded(folder, "surface", Limits()).problem
 
 
+def test_a_study_of_another_preset_than_the_models_is_outdated(case):
+    reader, folder = CaseReader(), str(case.folder)
+    files.write_json(case.folder / "study" / "study.json", study() | {"preset": "best"})
+    for model, validation in (({"preset": "best"}, "known"), ({"preset": "quick"}, "stale"), ({}, "known")):
+        files.write_json(case.model_folder / "model.json", model)
+        assert reader.recorded(folder, "surface", Limits()).validation == validation
+
+
 def test_a_study_of_other_poses_is_outdated(case):
     """Its verdict stood for a model that was trained since on a wider range, around another place."""
     reader, folder = CaseReader(), str(case.folder)

@@ -71,7 +71,7 @@ class CaseReader:
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:
-        """Rows of the validation table, study first, and whether the study is about older appearances or poses."""
+        """Rows of the validation table, study first, and whether the study is about others than the case's models."""
         model = self._once(case.model_folder / "model.json", _read_object)
         rows: list[Figures] = []
         study = self._once(case.folder / "study" / "study.json", _read_object)
@@ -86,7 +86,9 @@ class CaseReader:
             indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
             stale = bool(used) and used not in [index[1] for index in indices if index]
             # Of another craniotomy, or of a narrower range, they say nothing of the model that was trained since.
-            stale = bool(rows) and (stale or any(inputs.get(k) not in (None, render.get(k)) for k in POSES_DEPEND_ON))
+            stale = stale or any(inputs.get(k) not in (None, render.get(k)) for k in POSES_DEPEND_ON)
+            presets = {content["preset"] for content in (study, model or {}) if content.get("preset")}
+            stale = bool(rows) and (stale or len(presets) > 1)
         if model:
             rows = rows + figures_of_model(model)
         return rows, stale

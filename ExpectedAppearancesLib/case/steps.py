@@ -325,7 +325,7 @@ def _validation(chosen: Chosen, recorded: Recorded) -> Step:
         return Step(StepState.MISSING, "Train the model, or start a study." if possible else "Train the model first.")
     ready, reasons = recorded.verdict
     if recorded.validation == "stale":
-        return Step(StepState.STALE, "The figures belong to an older model of this case.")
+        return Step(StepState.STALE, "The study is about an older model of this case, or one of another preset.")
     if ready:
         return Step(StepState.DONE, "Ready: all limits are met.")
     return Step(StepState.MISSING, f"Not ready: {_counted(len(reasons), 'limit')} of 3 not met.")

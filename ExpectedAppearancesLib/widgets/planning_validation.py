@@ -121,6 +121,8 @@ class ValidationSection(Section):
         shown = deciding(rows)
         head = _("Ready") if ready else _("Not ready")
         colour = READY_COLOUR if ready else NOT_READY_COLOUR
+        if self.panel.recorded.validation == "stale":
+            head, colour = _("Outdated: make the study again"), NOT_READY_COLOUR
         lines = [f'<b style="color:{colour}">{head}</b>']
         lines += [f"– {html.escape(reason)}" for reason in reasons]
         lines.append(
