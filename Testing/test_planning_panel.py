@@ -462,3 +462,34 @@ for automatic in (True, False):
         assert widget.enabled is not automatic and isinstance(widget.toolTip, str) and widget.toolTip
 """
     )
+
+
+def test_a_full_disk_is_told_where_a_photograph_is_saved_or_a_camera_looked_through(tmp_path):
+    in_the_panel(
+        """
+import numpy as np
+from ExpectedAppearancesLib.widgets import planning_labelling, planning_look
+
+def full(*_arguments):
+    raise OSError(28, "No space left on device")
+
+np.save = full
+planning_labelling.slicer.util = told = MagicMock()
+planning_labelling.Child = MagicMock()
+planning_labelling.labelling.labels_of = lambda nodes: np.zeros((2, 2), np.uint8)
+panel.parameters.texturesPath = sys.argv[2]
+panel.sections["textures"].on_add("/photographs/a.png")
+labelling = panel.sections["textures"].labelling
+planning_labelling.Child.reset_mock()
+labelling.save()
+assert "No space left" in told.errorDisplay.call_args.args[0] and not planning_labelling.Child.called
+assert labelling._name == "a"  # what was drawn can be saved once there is space
+planning_look.planning.view_direction = lambda *_: (0.0, 100.0)
+panel.session.mesh = lambda p, name: MagicMock()
+sampler = MagicMock()
+sampler.camera.height = sampler.camera.width = 100
+panel.sections["poses"]._looking.refresh(panel.parameters, sampler)
+assert "No space left" in panel.ui.lookCaption.text
+""",
+        tmp_path,
+    )

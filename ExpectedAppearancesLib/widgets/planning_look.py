@@ -62,9 +62,14 @@ class Looking:
         )
         if not self._seen:
             self._say(_("What the camera sees is being drawn."))
+        try:
+            folder = self._folder_of(*meshes)
+        except OSError as error:  # the disk is full
+            self._say(str(error))
+            return
         number = max(self._views, default=0) + 1
         self._views[number] = (sampler, camera, pose, caption)
-        question = asked.question(self._folder_of(*meshes), camera, sampler.craniotomy.outward_axis, pose)
+        question = asked.question(folder, camera, sampler.craniotomy.outward_axis, pose)
         self._asking.ask(question | {"number": number})
 
     def stop(self) -> None:
