@@ -493,3 +493,18 @@ assert "No space left" in panel.ui.lookCaption.text
 """,
         tmp_path,
     )
+
+
+def test_a_case_of_a_scene_from_another_system_is_not_saved_somewhere(tmp_path):
+    """On Linux a folder of Windows would be made in whatever folder Slicer was started from."""
+    in_the_panel(
+        """
+panel.session.mesh = lambda p, name: None
+panel.parameters.vesselsNode, panel.ui.saveCaseButton.enabled = MagicMock(), True
+for folder, enabled in (("case", False), (sys.argv[2], True)):
+    panel.open_folder(folder)
+    assert panel.ui.saveCaseButton.enabled is enabled, panel.ui.saveCaseButton.toolTip
+    assert enabled or "is not there" in panel.ui.saveCaseButton.toolTip
+""",
+        tmp_path / "case",
+    )

@@ -36,7 +36,8 @@ class CaseReader:
         if not folder or not os.path.isfile(path):  # unlike pathlib's, False on a network drive that is gone
             # A scene from another computer, a drive taken away, or a case that was here a moment ago.
             known = self._case and self._case.folder == path.parent
-            gone = folder and (known or not os.path.isdir(path.parent.parent))
+            # On Linux a folder of Windows is a name without a place.
+            gone = folder and (known or not path.is_absolute() or not os.path.isdir(path.parent.parent))
             text = f"{folder}: is not there. Connect its drive, open the case where it is now, or choose New."
             return None, text if gone else ""
         case, problem = self._once(path, self._open)
