@@ -508,3 +508,26 @@ for folder, enabled in (("case", False), (sys.argv[2], True)):
 """,
         tmp_path / "case",
     )
+
+
+def test_a_photograph_is_labelled_only_for_a_folder_that_it_can_be_saved_in(tmp_path):
+    (tmp_path / "shared").mkdir()
+    in_the_panel(
+        """
+import os
+from ExpectedAppearancesLib.widgets import planning_labelling, planning_textures
+planning_labelling.Child, planning_textures.slicer.util = MagicMock(), MagicMock()
+textures, told = panel.sections["textures"], planning_textures.slicer.util.errorDisplay
+usual = os.access
+os.access = lambda path, mode: mode != os.W_OK and usual(path, mode)
+for folder in ("/shared", "/gone"):
+    panel.parameters.texturesPath = sys.argv[2] + folder
+    textures.on_add("/photographs/a.png")
+    assert folder + ": you may not write" in told.call_args.args[0] and textures.labelling._name == ""
+os.access = usual
+panel.parameters.texturesPath = sys.argv[2] + "/shared"
+textures.on_add("/photographs/a.png")
+assert textures.labelling._name == "a"
+""",
+        tmp_path,
+    )
