@@ -531,3 +531,38 @@ assert textures.labelling._name == "a"
 """,
         tmp_path,
     )
+
+
+def test_runs_of_the_cases_that_were_open_before_are_ended_with_the_scene_too(tmp_path):
+    in_the_panel(
+        """
+from pathlib import Path
+from ExpectedAppearancesLib.runs.state import RunState, RunStatus
+
+def run_of(folder, state=RunState.RUNNING):
+    run = MagicMock(kind="train", case_folder=Path(sys.argv[2]) / folder, started="today")
+    run.poll.return_value = RunStatus(state)
+    return run
+
+asked = []
+panel._choice = lambda runs: asked.append(runs) or module.WhenClosing.DETACH
+training, first, second = panel.runs["train"], run_of("first"), run_of("second")
+found = {"first": first, "second": second, "third": None}
+training.follow = lambda folder: setattr(training, "run", found[Path(folder).name])
+for folder in ("first", "second", "first", "third"):
+    panel.open_folder(str(Path(sys.argv[2]) / folder))
+panel.closing_scene()
+assert sorted(map(id, asked.pop())) == sorted(map(id, (first, second)))
+panel.closing_scene()
+assert not asked
+for folder in ("first", "third"):
+    panel.open_folder(str(Path(sys.argv[2]) / folder))
+panel.parameters.whenClosing = module.WhenClosing.END
+second.poll.return_value = first.poll.return_value = RunStatus(RunState.CANCELLING)
+panel.open_folder(str(Path(sys.argv[2]) / "second"))
+assert panel._ending == [first] and not panel._left  # it is seen to that it ends
+panel.quitting()
+assert first.wait.called and second.wait.called
+""",
+        tmp_path,
+    )
