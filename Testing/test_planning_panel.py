@@ -566,3 +566,18 @@ assert first.wait.called and second.wait.called
 """,
         tmp_path,
     )
+
+
+def test_who_declines_packages_is_not_asked_for_more():
+    in_the_panel(
+        """
+import contextlib
+from ExpectedAppearancesLib.widgets import planning_help
+util = planning_help.slicer.util = MagicMock()
+util.tryWithErrorDisplay = lambda *_, **__: contextlib.nullcontext()
+planning_help.dependencies.missing = lambda kind: ["filelock>=3.12"]
+util.confirmOkCancelDisplay.return_value = False
+panel.help.on_install()
+assert util.confirmOkCancelDisplay.call_count == 1
+"""
+    )

@@ -70,8 +70,8 @@ class HelpSection:
 
         with slicer.util.tryWithErrorDisplay(_("The packages could not be installed."), waitCursor=True):
             for kind in KINDS:
-                if dependencies.missing(kind):
-                    dependencies.install(kind, wheels_folder, confirm)
+                if not dependencies.install(kind, wheels_folder, confirm):
+                    break  # declined: not asked for more
         self._missing = None
         self.panel.refresh_soon()
 
