@@ -196,7 +196,7 @@ def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
     recorded = with_stage(replace(recorded, steps_trained=70), "train", done=False)
     recorded.manifest["stages"]["train"]["preset"] = {"name": "best", "minutes": 90.0}
     for preset, minutes, words in (
-        ("best", 90.0, "resume goes on from there"),
+        ("best", 90.0, "Continue goes on from there"),
         ("best", 120.0, "the time (was 90 min); so it begins anew"),
         ("quick", 26.0, "the preset (was best); so it begins anew"),
     ):
@@ -207,7 +207,7 @@ def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda recorded: recorded, "resume goes on from there"),
+        (lambda recorded: recorded, "Continue goes on from there"),
         (lambda recorded: replace(recorded, appearances_sha256="b"), "the expected appearances; so it begins anew"),
         (lambda recorded: with_stage(recorded, "render", craniotomy=MOVED), "the poses; so it begins anew"),
         (lambda recorded: with_stage(recorded, "render", ranges=STEEPER["ranges"]), "the poses; so it begins anew"),
