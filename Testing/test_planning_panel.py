@@ -581,3 +581,31 @@ panel.help.on_install()
 assert util.confirmOkCancelDisplay.call_count == 1
 """
     )
+
+
+def test_the_scan_of_the_case_before_is_not_seen_behind_a_case_without_one():
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.widgets import planning_case
+shown = {"Red": "scan", "Green": "atlas"}
+
+def composite(name):
+    node = MagicMock()
+    node.GetBackgroundVolumeID.side_effect = lambda: shown[name]
+    node.SetBackgroundVolumeID.side_effect = lambda volume: shown.update({name: volume})
+    return MagicMock(mrmlSliceCompositeNode=lambda: node)
+
+manager = planning_case.slicer.app = MagicMock()
+manager.layoutManager.return_value.sliceViewNames.return_value = list(shown)
+manager.layoutManager.return_value.sliceWidget.side_effect = composite
+scan, case = MagicMock(), panel.sections["case"]
+scan.GetID.return_value = "scan"
+list(case.showing_scan(None))
+assert shown == {"Red": "scan", "Green": "atlas"}
+list(case.showing_scan(scan))
+assert shown == {"Red": None, "Green": "atlas"}
+panel.parameters.mriVolume = scan
+list(case.showing_scan(scan))
+assert shown == {"Red": "scan", "Green": "scan"}
+"""
+    )

@@ -64,6 +64,25 @@ def test_a_case_is_opened_with_its_own_models_and_not_with_those_that_were_chang
     assert session.steps(p)["case"].state is StepState.DONE
 
 
+def test_models_of_the_case_before_are_not_seen_among_those_of_the_next(scene, planned, tmp_path):
+    session, p = planned
+    folders = [str(save(session, p, tmp_path / "first").folder)]
+    for node in (p.vesselsNode, p.cortexModel):
+        node.CreateDefaultDisplayNodes()
+        node.SetAndObserveTransformNodeID(None)
+    own = {p.vesselsNode, p.cortexModel}
+    folders.append(str(save(session, p, tmp_path / "second").folder))
+    models: list[set] = []
+    for index in (0, 0, 1, 0, 1):
+        list(adopting(session, p, folders[index], scene, print))
+        models += [{p.vesselsNode, p.cortexModel}] if index == len(models) else []
+        nodes = [scene.GetNthNodeByClass(i, "vtkMRMLModelNode") for i in range(2 + 2 * len(models))]
+        assert {node for node in nodes if node.GetDisplayVisibility()} == own | models[index]
+    p.vesselsNode, p.cortexModel = own
+    list(adopting(session, p, folders[0], scene, print))
+    assert not any(node.GetDisplayVisibility() for node in own)
+
+
 def test_another_cortex_is_a_change_also_where_the_vessels_are_those_of_the_case(scene, planned, tmp_path):
     session, p = planned
     p.casePath = str(save(session, p, tmp_path).folder)

@@ -42,6 +42,7 @@ def adopting(
             parameters.vesselsNode = parameters.cortexModel = None
         return None
     added: list = []
+    left = (parameters.vesselsNode, parameters.cortexModel) if parameters.casePath not in ("", folder) else ()
     try:
         for name in ("vessels", "cortex"):
             getattr(case, name)  # read, and kept
@@ -65,6 +66,8 @@ def adopting(
         parameters.vesselsNode, parameters.cortexModel = nodes[VESSELS], nodes.get(CORTEX)
         parameters.mriVolume = scan
         _adopt_settings(parameters, case, automatic)
+    for node in filter(None, (*left, *nodes.values())):  # two patients are not seen in one place
+        node.SetDisplayVisibility(node in nodes.values())
     yield from session.prepare(parameters)
     if parameters.craniotomySource.value == "recorded" and session.is_fitted(parameters):
         parameters.craniotomySource = type(parameters.craniotomySource)("fitted")

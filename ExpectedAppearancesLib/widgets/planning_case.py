@@ -127,10 +127,12 @@ class CaseSection(Section):
         if node is not None and self.parameters is not None and not self.panel.loading:
             self._showing.start(shown_in_slices(node))
 
-    def showing_scan(self) -> Iterator[None]:
-        """Show the MRI of a case that was opened, a view at each step."""
+    def showing_scan(self, before=None) -> Iterator[None]:
+        """Show the MRI of a case that was opened, a view at each step, or at least not `before`, another case's."""
         if self.parameters.mriVolume:
             yield from shown_in_slices(self.parameters.mriVolume, fit=True)
+        elif before is not None:
+            yield from shown_in_slices(None, instead_of=before)
 
     def on_new(self, folder: str = "") -> None:
         """Choose where the case will be; it is written when it is saved."""
@@ -297,14 +299,18 @@ class MicroscopeSection(Section):
         changed(self.parameters, "calibrationPath", self.ui.calibrationPathEdit.currentPath)
 
 
-def shown_in_slices(volume, fit: bool = False) -> Iterator[None]:
-    """Show a volume behind all slice views, one at each step: Slicer takes a tenth of a second for each."""
+def shown_in_slices(volume, fit: bool = False, instead_of=None) -> Iterator[None]:
+    """Show a volume, or none, behind all slice views, one at each step: Slicer takes a tenth of a second for each.
+
+    instead_of: only where this one is shown."""
     manager = slicer.app.layoutManager()
     for name in manager.sliceViewNames() if manager else ():
-        if volume.GetScene() is None:  # removed meanwhile
+        if volume is not None and volume.GetScene() is None:  # removed meanwhile
             return
         widget = manager.sliceWidget(name)
-        widget.mrmlSliceCompositeNode().SetBackgroundVolumeID(volume.GetID())
+        composite = widget.mrmlSliceCompositeNode()
+        if instead_of is None or composite.GetBackgroundVolumeID() == instead_of.GetID():
+            composite.SetBackgroundVolumeID(volume.GetID() if volume is not None else None)
         yield
         if fit:
             widget.sliceController().fitSliceToBackground()

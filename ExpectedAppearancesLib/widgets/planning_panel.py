@@ -202,6 +202,8 @@ class PlanningPanel:
         """Nothing can be changed in the panel meanwhile."""
         widgets = [section.button for section in self.sections.values()]
         before, self.opening = self.ui.nextLabel.text, True
+        scan_before = self.parameters.mriVolume
+        self.sections["poses"].leave()  # what the slice view showed before it was looked through is that of this case
         try:
             for widget in widgets:
                 widget.enabled = False
@@ -219,7 +221,7 @@ class PlanningPanel:
             self.ui.nextLabel.text, self.opening = before, False
         self.refresh()
         yield
-        yield from self.sections["case"].showing_scan()
+        yield from self.sections["case"].showing_scan(scan_before)
         self.unfold(self._next)
 
     def _adopting(self, folder: str) -> Iterator[None]:
