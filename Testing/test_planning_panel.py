@@ -609,3 +609,37 @@ list(case.showing_scan(scan))
 assert shown == {"Red": "scan", "Green": "scan"}
 """
     )
+
+
+def test_what_fails_leaves_the_panel_as_it_is_by_then():
+    """Slicer displays an error, and passes it on."""
+    in_the_panel(
+        """
+import contextlib
+from ExpectedAppearancesLib.widgets import planning_help, planning_panel
+planning_help.slicer.util = planning_panel.slicer.util = MagicMock()
+planning_panel.slicer.util.tryWithErrorDisplay = lambda *_, **__: contextlib.nullcontext()
+missing = {"planning": ["filelock>=3.12"], "training": ["torch>=2.4"]}
+
+def install(kind, *_):
+    if kind == "training":
+        raise OSError("no network")
+    missing[kind] = []
+    return True
+
+def refused(_folder):
+    raise PermissionError("vessels.vtp")
+
+planning_help.dependencies.missing, planning_help.dependencies.install = missing.get, install
+panel.help.enter()
+assert panel.help.reason("planning")
+panel.session.reader.case = refused
+for fails in (panel.help.on_install, lambda: list(panel._open_in_pieces("/case"))):
+    panel._timer.reset_mock()
+    with contextlib.suppress(OSError):
+        fails()
+        raise AssertionError
+    assert panel._timer.start.called and not panel.opening
+assert panel.help.reason("planning") == "" and panel.help.reason("training")
+"""
+    )

@@ -219,6 +219,7 @@ class PlanningPanel:
             for widget in widgets:
                 widget.enabled = True
             self.ui.nextLabel.text, self.opening = before, False
+            self.refresh_soon()  # what is displayed as an error ends this, too
         self.refresh()
         yield
         yield from self.sections["case"].showing_scan(scan_before)
