@@ -643,3 +643,22 @@ for fails in (panel.help.on_install, lambda: list(panel._open_in_pieces("/case")
 assert panel.help.reason("planning") == "" and panel.help.reason("training")
 """
     )
+
+
+def test_of_another_segmentation_the_segment_with_vessels_is_taken():
+    """Slicer calls the segments of every segmentation Segment_1, Segment_2."""
+    in_the_panel(
+        """
+def segmentation(names):
+    node = MagicMock()
+    node.GetSegmentation().GetNumberOfSegments.return_value = len(names)
+    node.GetSegmentation().GetNthSegmentID.side_effect = lambda i: f"Segment_{i + 1}"
+    node.GetSegmentation().GetSegment.side_effect = lambda i: MagicMock(GetName=lambda: names[int(i[-1]) - 1])
+    return node
+
+case, p = panel.sections["case"], panel.parameters
+for names, chosen in ((["Vessels"], 1), (["Brain", "vessels, left"], 2), (["A", "B"], 2), (["C"], 1), ([], None)):
+    case.on_vessels(segmentation(names))
+    assert p.vesselsSegmentId == (f"Segment_{chosen}" if chosen else ""), (names, p.vesselsSegmentId)
+"""
+    )

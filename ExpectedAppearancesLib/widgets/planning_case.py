@@ -113,9 +113,10 @@ class CaseSection(Section):
         if node is not None and node.IsA("vtkMRMLSegmentationNode"):
             segmentation = node.GetSegmentation()
             ids = [segmentation.GetNthSegmentID(i) for i in range(segmentation.GetNumberOfSegments())]
-            if p.vesselsSegmentId not in ids:
-                named = [i for i in ids if "vessel" in segmentation.GetSegment(i).GetName().lower()]
-                changed(p, "vesselsSegmentId", (named or ids or [""])[0])
+            named = [i for i in ids if "vessel" in segmentation.GetSegment(i).GetName().lower()]
+            # Of the segmentation before, maybe: Slicer calls the segments of each Segment_1, Segment_2.
+            kept = [i for i in ids if i == p.vesselsSegmentId]
+            changed(p, "vesselsSegmentId", (named or kept or ids or [""])[0])
 
     def on_segment(self, index: int) -> None:
         p = self.parameters
