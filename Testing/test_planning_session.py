@@ -232,6 +232,14 @@ def test_a_case_is_opened_with_the_textures_it_was_made_with(scene, planned, tmp
     (case.folder / "textures").mkdir()
     adopt(session, other, scene)
     assert other.texturesPath == str(case.folder / "textures")
+    moved = tmp_path / "elsewhere" / "case"
+    (moved / "textures").mkdir(parents=True)
+    (moved / "case.json").touch()
+    own.mkdir()
+    for folder, expected in ((str(moved / "textures"), str(case.folder / "textures")), (str(own), str(own))):
+        case.record("synthesize", textures_folder=folder)
+        adopt(session, other, scene)
+        assert other.texturesPath == expected
 
 
 def test_everything_on_a_network_drive_that_is_lost_is_told_as_gone(scene, planned, tmp_path, vanish):
