@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -425,6 +426,18 @@ def test_closing_ends_or_leaves_runs_as_the_user_chose(case, choice, answer, goe
     assert left[run].active == goes_on and run._tree.running() == goes_on
     assert bool(asked) == (answer is not None) and all(str(case) in text for text in asked)
     assert (Run.find(case, "synthesize") is not None) == goes_on
+
+
+@pytest.mark.skipif(os.name == "nt", reason="its time zone is not that of the environment")
+def test_what_goes_on_is_asked_about_in_the_users_words_and_time(monkeypatch):
+    monkeypatch.setenv("TZ", "America/New_York")
+    time.tzset()
+    try:
+        run = SimpleNamespace(kind="synthesize", case_folder="/cases/a", started="2026-01-02T03:04:05+00:00")
+        assert "- Expected appearances are being made in /cases/a, since 2026-01-01 22:04\n" in closing.question([run])
+    finally:
+        monkeypatch.undo()
+        time.tzset()
 
 
 def test_closing_asks_nothing_when_nothing_goes_on(case):
