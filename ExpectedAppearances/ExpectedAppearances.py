@@ -206,7 +206,9 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         self.removeObservers()
 
     def enter(self):
-        self.initializeParameterNode()
+        # Not at each visit: Slicer 5.8 lets go of no parameters that were ever bound, and each would hear every change.
+        if self._parameterNode is None:
+            self.initializeParameterNode()
         self.panel.enter()
 
     def exit(self):

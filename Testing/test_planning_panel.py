@@ -662,3 +662,27 @@ for names, chosen in ((["Vessels"], 1), (["Brain", "vessels, left"], 2), (["A", 
     assert p.vesselsSegmentId == (f"Segment_{chosen}" if chosen else ""), (names, p.vesselsSegmentId)
 """
     )
+
+
+def test_parameters_are_bound_once_and_not_at_each_visit():
+    """Slicer 5.8 goes on observing each of them: every visit made every change slower."""
+    in_the_panel(
+        """
+class Widget(module.ExpectedAppearancesWidget):
+    addObserver = removeObserver = lambda self, *_: None
+    logic = panel = MagicMock()
+    _parameterNode = _guiTag = None
+    def __init__(self):
+        pass
+
+widget = Widget()
+for _visit in range(3):
+    widget.enter()
+    widget.exit()
+assert widget.logic.getParameterNode.call_count == 1
+widget.onSceneStartClose(None, None)
+widget.onSceneEndClose(None, None)
+widget.enter()
+assert widget.logic.getParameterNode.call_count == 2
+"""
+    )
