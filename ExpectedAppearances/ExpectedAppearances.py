@@ -134,7 +134,7 @@ class ExpectedAppearancesParameterNode:
 
     craniotomySource: CraniotomySource = CraniotomySource.FITTED
     craniotomyNode: vtkMRMLDisplayableNode  # markups: a point list or a closed curve
-    tiltMaxDeg: Annotated[float, WithinRange(0, 90)] = 50.0
+    tiltMaxDeg: Annotated[float, WithinRange(0, 90)] = 70.0
     rollMaxDeg: Annotated[float, WithinRange(0, 180)] = 45.0
     distanceAuto: bool = True
     nearestMm: Annotated[float, WithinRange(1, 2000)] = 200.0
@@ -206,7 +206,9 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         self.removeObservers()
 
     def enter(self):
-        self.initializeParameterNode()
+        # Not at each visit: Slicer 5.8 lets go of no parameters that were ever bound, and each would hear every change.
+        if self._parameterNode is None:
+            self.initializeParameterNode()
         self.panel.enter()
 
     def exit(self):

@@ -73,7 +73,7 @@ def write_json(path: Path, value) -> None:
 def read_json(path: Path, what: str):
     """Parsed JSON of `path`; `what` names the content in the error message. Raises InputError."""
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # unlike pathlib's, False on a network drive that is gone
         raise InputError(f"{path}: {what} not found; check the path.")
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))  # Windows' editors put a mark before the text

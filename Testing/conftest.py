@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import cases
 import pytest
 
@@ -30,6 +33,25 @@ def frames(phantom):
     poses = [phantom.pose(i / 12) for i in range(12)]
     with PhantomPainter(phantom, SMALL) as painter:
         return poses, [painter.paint(pose) for pose in poses]
+
+
+@pytest.fixture
+def vanish(monkeypatch):
+    """A function that lets a folder answer as one of a mounted network drive does whose connection is lost."""
+    gone, stat, scandir = [], os.stat, os.scandir
+
+    def refused(usual):
+        def answer(path, *arguments, **named):
+            if any(str(path).startswith(str(folder)) for folder in gone):
+                raise OSError(errno.ENOTCONN, "Transport endpoint is not connected", str(path))
+            return usual(path, *arguments, **named)
+
+        return answer
+
+    monkeypatch.setattr(os, "stat", refused(stat))
+    monkeypatch.setattr(os, "scandir", refused(scandir))
+    yield gone.append
+    gone.clear()
 
 
 @pytest.fixture

@@ -226,6 +226,8 @@ def test_the_planning_panel_begins_with_what_the_commands_do_by_themselves():
     words = ["render", "CASE"]
     rendered = _build_parser(words).parse_args(words)
     assert (panel["poseCount"], panel["seed"]) == (rendered.poses, rendered.seed)
+    ranges = (panel["tiltMaxDeg"], panel["rollMaxDeg"], panel["inViewPercent"] / 100)
+    assert ranges == (rendered.tilt_deg, rendered.roll_deg, rendered.in_view)
 
 
 @every_module

@@ -11,6 +11,7 @@ import pytest
 
 from ExpectedAppearancesLib.case.meshes import read_mesh
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.evaluation.verdict import OWN_VALIDATION, Figures
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
@@ -224,6 +225,9 @@ def test_photograph_and_labels_survive_the_segment_editors_form(scene):
     assert (labelling.labels_of(nodes) == 1).all()
 
 
+SHARES = ("Within 3 mm, 3° (%)", "ADD below 3 mm (%)")
+
+
 def test_plots_are_found_again_and_filled_anew(scene):
     curve = [{"step": 10, "loss": None, "validation_add_mm": 5.0}, {"step": 20, "loss": 1.0, "validation_add_mm": 4.0}]
     chart = charts.show_training(scene, curve)
@@ -234,6 +238,16 @@ def test_plots_are_found_again_and_filled_anew(scene):
     series = {chart.GetNthPlotSeriesNode(i).GetName(): chart.GetNthPlotSeriesNode(i) for i in range(2)}
     rows = {name: node.GetTableNode().GetNumberOfRows() for name, node in series.items()}
     assert rows == {"Validation ADD (mm)": 2, "Loss": 2}
+    charts.show_training(scene, [])
+    assert [series[name].GetTableNode().GetNumberOfRows() for name in rows] == [0, 0]
+    table, chart = charts.show_figures(scene, [Figures("strict", "a", *[1.0] * 6)], 3.0)
+    assert (table.GetNumberOfRows(), chart.GetNumberOfPlotSeriesNodes()) == (1, 1)
+    own = Figures(OWN_VALIDATION, "", *[0.5] * 6)
+    charts.show_figures(scene, [Figures("strict", "a", *[1.0] * 6), own], 3.0)
+    shares = [[table.GetCellText(i, table.GetColumnIndex(name)) for i in range(2)] for name in SHARES]
+    assert shares == [["100.00", ""], ["", "50.00"]]  # each under its own name
+    assert charts.show_figures(scene, [], 3.0) == (table, chart)
+    assert (table.GetNumberOfRows(), chart.GetNumberOfPlotSeriesNodes()) == (0, 0)
 
 
 KEEP_THE_CONTEXT = """

@@ -27,7 +27,7 @@ from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import mri, planning, planning_session  # noqa: E402
 from ExpectedAppearancesLib.mrml.planning_adopt import adopt, adopting  # noqa: E402
-from ExpectedAppearancesLib.mrml.segment_surface import SegmentSurfaces  # noqa: E402
+from ExpectedAppearancesLib.mrml.segment_surface import SegmentSurfaces, answering  # noqa: E402
 
 
 def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
@@ -62,6 +62,25 @@ def test_a_case_is_opened_with_its_own_models_and_not_with_those_that_were_chang
     adopt(session, p, scene)
     assert p.vesselsNode is not opened
     assert session.steps(p)["case"].state is StepState.DONE
+
+
+def test_models_of_the_case_before_are_not_seen_among_those_of_the_next(scene, planned, tmp_path):
+    session, p = planned
+    folders = [str(save(session, p, tmp_path / "first").folder)]
+    for node in (p.vesselsNode, p.cortexModel):
+        node.CreateDefaultDisplayNodes()
+        node.SetAndObserveTransformNodeID(None)
+    own = {p.vesselsNode, p.cortexModel}
+    folders.append(str(save(session, p, tmp_path / "second").folder))
+    models: list[set] = []
+    for index in (0, 0, 1, 0, 1):
+        list(adopting(session, p, folders[index], scene, print))
+        models += [{p.vesselsNode, p.cortexModel}] if index == len(models) else []
+        nodes = [scene.GetNthNodeByClass(i, "vtkMRMLModelNode") for i in range(2 + 2 * len(models))]
+        assert {node for node in nodes if node.GetDisplayVisibility()} == own | models[index]
+    p.vesselsNode, p.cortexModel = own
+    list(adopting(session, p, folders[0], scene, print))
+    assert not any(node.GetDisplayVisibility() for node in own)
 
 
 def test_another_cortex_is_a_change_also_where_the_vessels_are_those_of_the_case(scene, planned, tmp_path):
@@ -213,6 +232,29 @@ def test_a_case_is_opened_with_the_textures_it_was_made_with(scene, planned, tmp
     (case.folder / "textures").mkdir()
     adopt(session, other, scene)
     assert other.texturesPath == str(case.folder / "textures")
+    moved = tmp_path / "elsewhere" / "case"
+    (moved / "textures").mkdir(parents=True)
+    (moved / "case.json").touch()
+    own.mkdir()
+    for folder, expected in ((str(moved / "textures"), str(case.folder / "textures")), (str(own), str(own))):
+        case.record("synthesize", textures_folder=folder)
+        adopt(session, other, scene)
+        assert other.texturesPath == expected
+
+
+def test_everything_on_a_network_drive_that_is_lost_is_told_as_gone(scene, planned, tmp_path, vanish):
+    """The panel asks at every change; what it is told must be an answer, not an error of the system."""
+    session, p = planned
+    case = save(session, p, tmp_path)
+    (case.folder / "textures").mkdir()
+    p.casePath, p.texturesPath = str(case.folder), str(case.folder / "textures")
+    assert session.steps(p)["case"].state is StepState.DONE
+    vanish(tmp_path)
+    for calibration in ("camera.json", "camera.yml"):
+        p.calibrationPath = str(case.folder / calibration)
+        steps = session.steps(p)
+        assert "Connect its drive" in steps["case"].text and "not found" in steps["microscope"].text
+        assert "no longer there" in steps["textures"].text and session.texture_files(p) == {}
 
 
 def test_microscope_from_its_field_of_view(planned):
@@ -384,6 +426,48 @@ def test_the_surface_of_a_segment_comes_from_a_process_and_an_outdated_one_never
         )
     finally:
         worker.stop()
+
+
+def test_a_segment_is_taken_with_the_smoothing_that_is_set_for_its_surface(scene, planned, tmp_path):
+    """In the Segment Editor's menu of Show 3D: thin vessels vanish where they are smoothed much."""
+    session, p = planned
+    image = slicer.vtkOrientedImageData()
+    image.SetExtent(0, 19, 0, 19, 0, 19)
+    image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
+    voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(20, 20, 20)
+    voxels[:] = 0
+    voxels[3:17, 9:11, 9:11] = 1
+    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "S")
+    p.vesselsSegmentId = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
+    p.vesselsNode, segmentation = node, node.GetSegmentation()
+
+    def width_mm() -> float:
+        return np.ptp(session.mesh(p, "vessels").vertices_mm[:, 0])
+
+    def smooth(factor: float, shown: bool) -> None:
+        segmentation.SetConversionParameter("Smoothing factor", str(factor))
+        if shown:
+            segmentation.CreateRepresentation("Closed surface", True)
+
+    usual = width_mm()
+    smooth(0.5, shown=True)
+    assert width_mm() == pytest.approx(usual, abs=1e-3)
+    smooth(0.0, shown=True)
+    sharp = width_mm()
+    assert sharp > usual + 0.1
+    segmentation.RemoveRepresentation("Closed surface")
+    assert width_mm() == pytest.approx(sharp, abs=1e-3)
+    smooth(0.5, shown=False)
+    assert width_mm() == pytest.approx(usual, abs=1e-3)
+    smooth(0.0, shown=False)
+    asked: list[dict] = []
+    surfaces = SegmentSurfaces(asked.append)
+    list(surfaces.asking(node, p.vesselsSegmentId, tmp_path))
+    surfaces.take(asked[0], {"answer": answering()(asked[0])})
+    made = surfaces.made(node, p.vesselsSegmentId)
+    assert np.ptp(made.vertices_mm[:, 0]) == pytest.approx(sharp, abs=1e-3)
+    smooth(0.5, shown=False)
+    assert surfaces.to_ask(node, p.vesselsSegmentId)
 
 
 def test_the_session_loads_nothing_heavy():

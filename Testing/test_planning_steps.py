@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 from dataclasses import replace
 
 import cases
@@ -195,7 +196,7 @@ def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
     recorded = with_stage(replace(recorded, steps_trained=70), "train", done=False)
     recorded.manifest["stages"]["train"]["preset"] = {"name": "best", "minutes": 90.0}
     for preset, minutes, words in (
-        ("best", 90.0, "resume goes on from there"),
+        ("best", 90.0, "Continue goes on from there"),
         ("best", 120.0, "the time (was 90 min); so it begins anew"),
         ("quick", 26.0, "the preset (was best); so it begins anew"),
     ):
@@ -206,7 +207,7 @@ def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda recorded: recorded, "resume goes on from there"),
+        (lambda recorded: recorded, "Continue goes on from there"),
         (lambda recorded: replace(recorded, appearances_sha256="b"), "the expected appearances; so it begins anew"),
         (lambda recorded: with_stage(recorded, "render", craniotomy=MOVED), "the poses; so it begins anew"),
         (lambda recorded: with_stage(recorded, "render", ranges=STEEPER["ranges"]), "the poses; so it begins anew"),
@@ -329,6 +330,14 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     assert "SHA-256" in reader.recorded(folder, "surface", Limits()).problem
 
 
+def test_a_study_of_another_preset_than_the_models_is_outdated(case):
+    reader, folder = CaseReader(), str(case.folder)
+    files.write_json(case.folder / "study" / "study.json", study() | {"preset": "best"})
+    for model, validation in (({"preset": "best"}, "known"), ({"preset": "quick"}, "stale"), ({}, "known")):
+        files.write_json(case.model_folder / "model.json", model)
+        assert reader.recorded(folder, "surface", Limits()).validation == validation
+
+
 def test_a_study_of_other_poses_is_outdated(case):
     """Its verdict stood for a model that was trained since on a wider range, around another place."""
     reader, folder = CaseReader(), str(case.folder)
@@ -346,10 +355,12 @@ def test_a_study_of_other_poses_is_outdated(case):
 
 def test_a_case_whose_drive_is_gone_is_told_and_not_taken_for_one_to_be_saved(tmp_path):
     """A scene that was saved elsewhere: its models are there, its case is not."""
-    recorded = CaseReader().recorded(str(tmp_path / "drive" / "case"), "surface", Limits())
-    for has_vessels in (True, False):
-        step = plan_steps(replace(finished()[0], has_vessels=has_vessels), recorded)["case"]
-        assert step.state is MISSING and "Connect its drive" in step.text
+    elsewhere = "/cases/a" if os.name == "nt" else r"C:\cases\a"
+    for folder in (str(tmp_path / "drive" / "case"), elsewhere):
+        recorded = CaseReader().recorded(folder, "surface", Limits())
+        for has_vessels in (True, False):
+            step = plan_steps(replace(finished()[0], has_vessels=has_vessels), recorded)["case"]
+            assert step.state is MISSING and "Connect its drive" in step.text
 
 
 def test_a_case_that_is_moved_while_it_is_open_is_told(case):

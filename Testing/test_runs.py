@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -210,6 +211,15 @@ def test_a_run_that_is_killed_by_the_system_leaves_nothing_behind(case):
     status = run.wait(DEADLINE_S)
     assert status.state is RunState.FAILED and "memory" in status.problem
     assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in tree)
+
+
+def test_the_end_of_a_run_is_seen_although_its_drive_is_gone(case, vanish):
+    run = start(case, "wait")
+    wait_until_ready(case, run)
+    run._tree.kill()
+    vanish(case.parent)
+    assert run.wait(DEADLINE_S).state is RunState.FAILED
+    assert Run.find(case, "synthesize") is None
 
 
 def test_a_second_run_of_the_kind_is_refused_while_one_goes_on(case):
@@ -416,6 +426,18 @@ def test_closing_ends_or_leaves_runs_as_the_user_chose(case, choice, answer, goe
     assert left[run].active == goes_on and run._tree.running() == goes_on
     assert bool(asked) == (answer is not None) and all(str(case) in text for text in asked)
     assert (Run.find(case, "synthesize") is not None) == goes_on
+
+
+@pytest.mark.skipif(os.name == "nt", reason="its time zone is not that of the environment")
+def test_what_goes_on_is_asked_about_in_the_users_words_and_time(monkeypatch):
+    monkeypatch.setenv("TZ", "America/New_York")
+    time.tzset()
+    try:
+        run = SimpleNamespace(kind="synthesize", case_folder="/cases/a", started="2026-01-02T03:04:05+00:00")
+        assert "- Expected appearances are being made in /cases/a, since 2026-01-01 22:04\n" in closing.question([run])
+    finally:
+        monkeypatch.undo()
+        time.tzset()
 
 
 def test_closing_asks_nothing_when_nothing_goes_on(case):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -32,9 +33,11 @@ class CaseReader:
     def case(self, folder: str) -> tuple[Case | None, str]:
         """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
         path = Path(folder) / MANIFEST_NAME
-        if not folder or not path.is_file():
+        if not folder or not os.path.isfile(path):  # unlike pathlib's, False on a network drive that is gone
             # A scene from another computer, a drive taken away, or a case that was here a moment ago.
-            gone = folder and (not path.parent.parent.is_dir() or (self._case and self._case.folder == path.parent))
+            known = self._case and self._case.folder == path.parent
+            # On Linux a folder of Windows is a name without a place.
+            gone = folder and (known or not path.is_absolute() or not os.path.isdir(path.parent.parent))
             text = f"{folder}: is not there. Connect its drive, open the case where it is now, or choose New."
             return None, text if gone else ""
         case, problem = self._once(path, self._open)
@@ -69,7 +72,7 @@ class CaseReader:
         )
 
     def figures(self, case: Case) -> tuple[list[Figures], bool]:
-        """Rows of the validation table, study first, and whether the study is about older appearances or poses."""
+        """Rows of the validation table, study first, and whether the study is about others than the case's models."""
         model = self._once(case.model_folder / "model.json", _read_object)
         rows: list[Figures] = []
         study = self._once(case.folder / "study" / "study.json", _read_object)
@@ -84,7 +87,9 @@ class CaseReader:
             indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
             stale = bool(used) and used not in [index[1] for index in indices if index]
             # Of another craniotomy, or of a narrower range, they say nothing of the model that was trained since.
-            stale = bool(rows) and (stale or any(inputs.get(k) not in (None, render.get(k)) for k in POSES_DEPEND_ON))
+            stale = stale or any(inputs.get(k) not in (None, render.get(k)) for k in POSES_DEPEND_ON)
+            presets = {content["preset"] for content in (study, model or {}) if content.get("preset")}
+            stale = bool(rows) and (stale or len(presets) > 1)
         if model:
             rows = rows + figures_of_model(model)
         return rows, stale

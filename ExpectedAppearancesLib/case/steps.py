@@ -268,7 +268,7 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
     if changed:
         return Step(StepState.STALE, f"Changed since they were made: {_listed(changed)}. Start makes what is missing.")
     if not index["done"]:
-        return Step(StepState.READY, "Stopped; start goes on where it was.")
+        return Step(StepState.READY, "Stopped; Continue goes on where it was.")
     return Step(StepState.DONE, f"{_counted(len(index['items']), 'expected appearance')} made.")
 
 
@@ -289,7 +289,7 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
                 changed.append("the poses")
             if changed:
                 return Step(StepState.READY, f"{stopped}. Changed since: {_listed(changed)}; so it begins anew.")
-            return Step(StepState.READY, f"{stopped}; resume goes on from there.")
+            return Step(StepState.READY, f"{stopped}; Continue goes on from there.")
         return Step(StepState.READY, "All is there: start.")
     changed = []
     if _appearances_changed(stages, train, recorded.appearances_sha256):
@@ -325,7 +325,7 @@ def _validation(chosen: Chosen, recorded: Recorded) -> Step:
         return Step(StepState.MISSING, "Train the model, or start a study." if possible else "Train the model first.")
     ready, reasons = recorded.verdict
     if recorded.validation == "stale":
-        return Step(StepState.STALE, "The figures belong to an older model of this case.")
+        return Step(StepState.STALE, "The study is about an older model of this case, or one of another preset.")
     if ready:
         return Step(StepState.DONE, "Ready: all limits are met.")
     return Step(StepState.MISSING, f"Not ready: {_counted(len(reasons), 'limit')} of 3 not met.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -151,7 +152,7 @@ def write_camera(path: Path, camera: Camera) -> None:
 def _read_opencv_calibration(path: Path) -> Camera:
     import cv2
 
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"{path}: camera not found; check the path.")
     try:
         # From memory: FileStorage cannot open non-ASCII paths on Windows.

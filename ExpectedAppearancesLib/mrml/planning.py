@@ -76,6 +76,7 @@ def _segment_surface(node, segment_id: str):
     copy = slicer.vtkSegmentation()
     copy.SetSourceRepresentationName(segmentation.GetSourceRepresentationName())
     copy.CopySegmentFromSegmentation(segmentation, segment_id)
+    copy.CopyConversionParameters(segmentation)
     name = slicer.vtkSegmentationConverter.GetSegmentationClosedSurfaceRepresentationName()
     if not copy.CreateRepresentation(name):
         raise InputError(no_surface(node.GetName()))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
 
-from ..case.case import Case
+from ..case.case import MANIFEST_NAME, Case
 from ..case.steps import LENGTH_TOLERANCE_MM
 from ..errors import InputError
 from ..poses.sampling import PoseRanges
@@ -42,6 +44,7 @@ def adopting(
             parameters.vesselsNode = parameters.cortexModel = None
         return None
     added: list = []
+    left = (parameters.vesselsNode, parameters.cortexModel) if parameters.casePath not in ("", folder) else ()
     try:
         for name in ("vessels", "cortex"):
             getattr(case, name)  # read, and kept
@@ -65,6 +68,8 @@ def adopting(
         parameters.vesselsNode, parameters.cortexModel = nodes[VESSELS], nodes.get(CORTEX)
         parameters.mriVolume = scan
         _adopt_settings(parameters, case, automatic)
+    for node in filter(None, (*left, *nodes.values())):  # two patients are not seen in one place
+        node.SetDisplayVisibility(node in nodes.values())
     yield from session.prepare(parameters)
     if parameters.craniotomySource.value == "recorded" and session.is_fitted(parameters):
         parameters.craniotomySource = type(parameters.craniotomySource)("fitted")
@@ -88,8 +93,14 @@ def _adopt_settings(parameters, case: Case, automatic: PoseRanges) -> None:
     if preset.get("name") in [choice.value for choice in type(parameters.preset)]:
         parameters.preset = type(parameters.preset)(preset["name"])
         _take(parameters, "minutes", preset.get("minutes"))
-    own_textures = case.folder / "textures"
-    parameters.texturesPath = str(own_textures) if own_textures.is_dir() else synthesize.get("textures_folder", "")
+    parameters.texturesPath = _textures_of(case, synthesize.get("textures_folder", ""))
+
+
+def _textures_of(case: Case, made_from: str) -> str:
+    """The folder that the appearances were made from, unless that is the case's own, which moves with the case."""
+    own = case.folder / "textures"
+    elsewhere = made_from and os.path.isdir(made_from) and not (Path(made_from).parent / MANIFEST_NAME).is_file()
+    return str(own) if own.is_dir() and not elsewhere else made_from
 
 
 def _models(scene, case: Case, added: list) -> Generator[None, None, dict]:

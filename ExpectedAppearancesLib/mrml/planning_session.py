@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from ..poses.craniotomy import Craniotomy, find_craniotomy, has_own_axis
 from ..poses.sampling import PoseRanges, PoseSampler
 from ..textures.library import list_textures, names_taken_twice, shipped_textures_folder
 from . import mri, planning
-from .segment_surface import SegmentSurfaces, voxels_version
+from .segment_surface import SegmentSurfaces, segment_version
 
 SURFACE_WAITING = "The surface of the segment is being made."
 MODELS = {"vessels": "vessel model", "cortex": "cortex model"}
@@ -80,7 +81,7 @@ class PlanningSession:
         if not parameters.calibrationPath:
             raise InputError("Choose a calibration file, or give the field of view.")
         path = Path(parameters.calibrationPath)
-        version = (str(path), path.stat().st_mtime_ns if path.is_file() else None)
+        version = (str(path), path.stat().st_mtime_ns if os.path.isfile(path) else None)
         try:
             return self._once("camera", version, lambda: read_camera(path))
         except ImportError as error:
@@ -339,7 +340,7 @@ class PlanningSession:
 
     def _textures(self, parameters) -> tuple[dict[str, str], str]:
         folder = self.textures_folder(parameters)
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             return {}, f"{folder}: is no longer there; choose another folder."
         found = self.texture_files(parameters)
         bad = [self.texture_problems[version] for version, *_ in found.values() if version in self.texture_problems]
@@ -377,7 +378,7 @@ def _version_of(node, segment_id: str = "") -> tuple:
     """Changes with the node's content and with the transforms above it."""
     moved = _moved(node)
     if node.IsA("vtkMRMLSegmentationNode"):
-        return (voxels_version(node, segment_id), moved)
+        return (segment_version(node, segment_id), moved)
     if node.IsA("vtkMRMLModelNode"):
         return (node.GetPolyData().GetMTime() if node.GetPolyData() else 0, moved)
     raise ValueError(f"{node.GetClassName()}: neither model nor segmentation")

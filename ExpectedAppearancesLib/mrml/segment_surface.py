@@ -52,6 +52,7 @@ class SegmentSurfaces:
             "voxels": str(folder / "voxels.bin"),
             "extent": list(image.GetExtent()),
             "image_to_world": [matrix.GetElement(i, j) for i in range(4) for j in range(4)],
+            "conversion": node.GetSegmentation().SerializeAllConversionParameters(),
             "name": node.GetName(),
         }
         planes = max(1, PIECE_VOXELS // max(1, voxels[0].size))
@@ -94,16 +95,18 @@ class SegmentSurfaces:
         return surface
 
 
-def voxels_version(node, segment_id: str) -> int:
-    """Changes with what a segment is drawn as."""
+def segment_version(node, segment_id: str) -> tuple:
+    """Changes with what a segment is drawn as, with its surface, and with how one is to be made of it."""
     segmentation = node.GetSegmentation()
     segment = segmentation.GetSegment(segment_id) if segment_id else None
-    source = segment.GetRepresentation(segmentation.GetSourceRepresentationName()) if segment else None
-    return source.GetMTime() if source else 0
+    if segment is None:
+        return (0, 0, "")
+    parts = (segment.GetRepresentation(name) for name in (segmentation.GetSourceRepresentationName(), SURFACE))
+    return (*(part.GetMTime() if part else 0 for part in parts), segmentation.SerializeAllConversionParameters())
 
 
 def _version(node, segment_id: str) -> tuple:
-    return (node.GetID(), segment_id, voxels_version(node, segment_id))
+    return (node.GetID(), segment_id, *segment_version(node, segment_id))
 
 
 def labelmap_of(node, segment_id: str):
@@ -154,6 +157,7 @@ def _answer(core, asked: dict) -> list:
     segmentation = core.vtkSegmentation()
     segmentation.SetSourceRepresentationName(LABELMAP)
     segmentation.AddSegment(segment, "vessels")
+    segmentation.DeserializeConversionParameters(asked["conversion"])
     if not segmentation.CreateRepresentation(SURFACE):
         raise InputError(no_surface(asked["name"]))
     mesh = Mesh.from_polydata(segment.GetRepresentation(SURFACE))

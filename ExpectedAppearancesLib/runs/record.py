@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import importlib.util
 import logging
 import os
 import platform
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -57,7 +58,7 @@ def record_path(case_folder: Path, kind: str) -> Path:
 def read_record(case_folder: Path, kind: str) -> RunRecord | None:
     """The newest run of this kind that was started on this computer; None where there is none that can be read."""
     path = record_path(case_folder, kind)
-    if not path.is_file():
+    if not os.path.isfile(path):
         return None
     try:
         content = files.read_json(path, "record of a run")
@@ -116,7 +117,7 @@ def exclusive(folder: Path, name: str, timeout_s: float = 0.0, work: str = "") -
     work: what is done, where several processes may do it together: one that does the same as the holder is let in.
     Raises InputError, which names the holder, when somebody else holds it.
     """
-    path = runs_folder(folder) / f"{name}.lock"
+    path = _lock_path(folder, name)
     with files.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = _locked(path, timeout_s)
@@ -133,6 +134,20 @@ def exclusive(folder: Path, name: str, timeout_s: float = 0.0, work: str = "") -
             with contextlib.suppress(OSError):
                 _holder_path(path).unlink()
             lock.release()
+
+
+def refuse_if_occupied(folder: Path, kinds: Iterable[str] = tuple(NAMES)) -> None:
+    """Raise InputError, which names it, where a run of one of these kinds goes on in the case, whoever started it."""
+    if importlib.util.find_spec("filelock") is None:
+        return
+    for kind in kinds:
+        if os.path.exists(_lock_path(folder, kind)):  # in a case that cannot be written there is none to be made
+            with exclusive(folder, kind):
+                pass
+
+
+def _lock_path(folder: Path, name: str) -> Path:
+    return runs_folder(folder) / f"{name}.lock"
 
 
 def _locked(path: Path, timeout_s: float):

@@ -50,9 +50,10 @@ def is_unfinished(kind: str, case_folder: Path) -> bool:
 def remove_partial_files(case_folder: Path, pids: Iterable[int]) -> None:
     """Remove what `files.replacing` leaves behind when its process is killed; those processes must have ended."""
     for pid in pids:
-        for path in Path(case_folder).rglob(f".*.{pid}.part*"):
-            with contextlib.suppress(OSError):
-                path.unlink()
+        with contextlib.suppress(OSError):  # the drive is gone
+            for path in Path(case_folder).rglob(f".*.{pid}.part*"):
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
 
 def _study_problem(path: Path) -> str:

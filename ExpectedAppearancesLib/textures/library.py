@@ -133,7 +133,7 @@ def list_textures(folder: Path) -> dict[str, tuple[Path, Path | None]]:
     For panels, which show what is there before all of it is right.
     """
     folder = Path(folder)
-    images = _named_images(folder)[0] if folder.is_dir() else {}
+    images = _named_images(folder)[0] if os.path.isdir(folder) else {}
     labels = ((name, (folder / f"{name}{LABELS_SUFFIX}", folder / SHARED_LABELS)) for name in images)
     return {name: (images[name], next((path for path in paths if path.is_file()), None)) for name, paths in labels}
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
+
 import qt
 from slicer.i18n import tr as _
 
 from ..case.steps import StepState
 from ..gpus import device_arguments
 from .planning_run import RunControls, in_the_way, started
-from .planning_section import Section
+from .planning_section import Section, changed
 
 NEWEST_PX = 220
+USUAL_SIZE_PX = {"surface": 384, "image": 256}
 
 
 class AppearancesSection(Section):
@@ -20,7 +23,6 @@ class AppearancesSection(Section):
     def setup(self) -> None:
         ui = self.ui
         self._shown: tuple | None = None
-        self._method: str | None = None
         self.controls = RunControls(
             self.panel.runs["synthesize"],
             ui.appearancesStart,
@@ -51,15 +53,14 @@ class AppearancesSection(Section):
     def close(self) -> None:
         self._shown = None
 
-    def on_method(self, _index: int) -> None:
+    def on_method(self, index: int) -> None:
         """Each method has a size at which it works well."""
         p = self.parameters
-        if p is None or self.panel.loading or self._method == p.method.value:
+        if p is None or self.panel.loading or index < 0:
             return
-        usual = {"surface": 384, "image": 256}
-        if self._method is not None and p.sizePx == usual.get(self._method):
-            p.sizePx = usual[p.method.value]
-        self._method = p.method.value
+        before, chosen = p.method, list(type(p.method))[index]
+        if changed(p, "method", chosen) and p.sizePx == USUAL_SIZE_PX[before.value]:  # see on_preset of the training
+            p.sizePx = USUAL_SIZE_PX[chosen.value]
 
     def on_start(self) -> None:
         started(self.panel, self.controls.watch, *self.arguments())
@@ -76,9 +77,12 @@ class AppearancesSection(Section):
         case = self.session.case(p)
         path, count = self.session.reader.newest_image(case, p.method.value) if case else (None, 0)
         self.ui.newestImage.visible = path is not None
-        if path is None or (path, count) == self._shown:
+        if path is None or not os.path.isfile(path):
             return
-        self._shown = (path, count)
+        version = (path, count, os.path.getmtime(path))  # one that is made again has the name of the old one
+        if version == self._shown:
+            return
+        self._shown = version
         picture = qt.QPixmap(str(path))
         if picture.isNull():
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import shutil
 import tempfile
 import time
@@ -17,6 +18,7 @@ from ..case.case import MANIFEST_NAME
 from ..case.steps import StepState
 from ..errors import InputError
 from ..mrml.mri import keeping_scan
+from ..runs.record import refuse_if_occupied
 from .planning_qt import Child, Stepper, allow, library_command, problems_in, quiet
 from .planning_section import NodeWatch, Section, changed
 
@@ -67,7 +69,7 @@ class CaseSection(Section):
             reason = _("A run is going on in this case; wait until it has ended, or cancel it.")
         elif not folder:
             reason = _("Choose a folder for the case with New.")
-        elif not Path(folder).parent.is_dir():
+        elif not (os.path.isabs(folder) and os.path.isdir(Path(folder).parent)):
             reason = self.step.text
         elif p.vesselsNode is None and self.session.case(p) is None:
             reason = _("Choose the vessel model first.")
@@ -111,9 +113,10 @@ class CaseSection(Section):
         if node is not None and node.IsA("vtkMRMLSegmentationNode"):
             segmentation = node.GetSegmentation()
             ids = [segmentation.GetNthSegmentID(i) for i in range(segmentation.GetNumberOfSegments())]
-            if p.vesselsSegmentId not in ids:
-                named = [i for i in ids if "vessel" in segmentation.GetSegment(i).GetName().lower()]
-                changed(p, "vesselsSegmentId", (named or ids or [""])[0])
+            named = [i for i in ids if "vessel" in segmentation.GetSegment(i).GetName().lower()]
+            # Of the segmentation before, maybe: Slicer calls the segments of each Segment_1, Segment_2.
+            kept = [i for i in ids if i == p.vesselsSegmentId]
+            changed(p, "vesselsSegmentId", (named or kept or ids or [""])[0])
 
     def on_segment(self, index: int) -> None:
         p = self.parameters
@@ -125,10 +128,12 @@ class CaseSection(Section):
         if node is not None and self.parameters is not None and not self.panel.loading:
             self._showing.start(shown_in_slices(node))
 
-    def showing_scan(self) -> Iterator[None]:
-        """Show the MRI of a case that was opened, a view at each step."""
+    def showing_scan(self, before=None) -> Iterator[None]:
+        """Show the MRI of a case that was opened, a view at each step, or at least not `before`, another case's."""
         if self.parameters.mriVolume:
             yield from shown_in_slices(self.parameters.mriVolume, fit=True)
+        elif before is not None:
+            yield from shown_in_slices(None, instead_of=before)
 
     def on_new(self, folder: str = "") -> None:
         """Choose where the case will be; it is written when it is saved."""
@@ -208,6 +213,7 @@ class CaseSection(Section):
     def _put_in_place(self, made: Path, folder: Path) -> None:
         try:
             if made != folder:
+                refuse_if_occupied(folder)  # what goes on there would write into the new case
                 if (folder / OWN_TEXTURES).is_dir():
                     shutil.copytree(folder / OWN_TEXTURES, made / OWN_TEXTURES)
                 kept = _kept_name(folder)
@@ -226,6 +232,10 @@ class CaseSection(Section):
                     )
                 ]
             )
+            return
+        except InputError as error:
+            shutil.rmtree(made, ignore_errors=True)
+            self._tell(error.problems)
             return
         if Path(self.parameters.casePath) == folder:  # else another case was opened meanwhile
             self.panel.open_folder(str(folder))
@@ -290,14 +300,18 @@ class MicroscopeSection(Section):
         changed(self.parameters, "calibrationPath", self.ui.calibrationPathEdit.currentPath)
 
 
-def shown_in_slices(volume, fit: bool = False) -> Iterator[None]:
-    """Show a volume behind all slice views, one at each step: Slicer takes a tenth of a second for each."""
+def shown_in_slices(volume, fit: bool = False, instead_of=None) -> Iterator[None]:
+    """Show a volume, or none, behind all slice views, one at each step: Slicer takes a tenth of a second for each.
+
+    instead_of: only where this one is shown."""
     manager = slicer.app.layoutManager()
     for name in manager.sliceViewNames() if manager else ():
-        if volume.GetScene() is None:  # removed meanwhile
+        if volume is not None and volume.GetScene() is None:  # removed meanwhile
             return
         widget = manager.sliceWidget(name)
-        widget.mrmlSliceCompositeNode().SetBackgroundVolumeID(volume.GetID())
+        composite = widget.mrmlSliceCompositeNode()
+        if instead_of is None or composite.GetBackgroundVolumeID() == instead_of.GetID():
+            composite.SetBackgroundVolumeID(volume.GetID() if volume is not None else None)
         yield
         if fit:
             widget.sliceController().fitSliceToBackground()

@@ -68,12 +68,14 @@ class HelpSection:
             text = _("These Python packages will be installed into this Slicer:") + "\n\n" + "\n".join(names)
             return slicer.util.confirmOkCancelDisplay(text, windowTitle=_("Install Python packages"))
 
-        with slicer.util.tryWithErrorDisplay(_("The packages could not be installed."), waitCursor=True):
-            for kind in KINDS:
-                if dependencies.missing(kind):
-                    dependencies.install(kind, wheels_folder, confirm)
-        self._missing = None
-        self.panel.refresh_soon()
+        try:
+            with slicer.util.tryWithErrorDisplay(_("The packages could not be installed."), waitCursor=True):
+                for kind in KINDS:
+                    if not dependencies.install(kind, wheels_folder, confirm):
+                        break  # declined: not asked for more
+        finally:  # what is displayed as an error ends this, too
+            self._missing = None
+            self.panel.refresh_soon()
 
     def on_install_from_folder(self) -> None:
         folder = qt.QFileDialog.getExistingDirectory(slicer.util.mainWindow(), _("Folder of wheels"), "")

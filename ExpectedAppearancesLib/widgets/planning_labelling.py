@@ -9,6 +9,8 @@ import numpy as np
 import slicer
 from slicer.i18n import tr as _
 
+from .. import files
+from ..errors import InputError
 from ..masks.labels import PARENCHYMA
 from ..mrml import labelling
 from ..mrml.planning import remove_nodes
@@ -95,7 +97,13 @@ class Labelling:
 
     def save(self) -> None:
         """Write NAME.png and NAME.labels.png into their folder in a process of its own, or say why not."""
-        np.save(Path(self._folder.name) / LABELS, labelling.labels_of(self.nodes))
+        path = Path(self._folder.name) / LABELS
+        try:
+            with files.writing(path):
+                np.save(path, labelling.labels_of(self.nodes))
+        except InputError as error:
+            slicer.util.errorDisplay(str(error), windowTitle=_("Not saved yet"))
+            return
         kept = (self._folder.name, str(self._textures), self._name)
         command, environment = library_command(PHOTOGRAPH_MODULE, "keep", *kept)
         self._child, self._saving = Child(command, self._saved, environment), True

@@ -62,9 +62,14 @@ class Looking:
         )
         if not self._seen:
             self._say(_("What the camera sees is being drawn."))
+        try:
+            folder = self._folder_of(*meshes)
+        except OSError as error:  # the disk is full
+            self._say(str(error))
+            return
         number = max(self._views, default=0) + 1
         self._views[number] = (sampler, camera, pose, caption)
-        question = asked.question(self._folder_of(*meshes), camera, sampler.craniotomy.outward_axis, pose)
+        question = asked.question(folder, camera, sampler.craniotomy.outward_axis, pose)
         self._asking.ask(question | {"number": number})
 
     def stop(self) -> None:
@@ -121,6 +126,7 @@ class Looking:
             return
         if self._slice_before is None:
             self._slice_before = _SliceBefore(slice_node, composite)
+        self._slice_before.notice(composite)
         planning.look_at_mask(slice_node, camera, pose, plane_mm, space)
         modifying = composite.StartModify()
         composite.SetBackgroundVolumeID(None)
@@ -165,10 +171,17 @@ class _SliceBefore:
             composite.GetLabelOpacity(),
         )
 
+    def notice(self, composite) -> None:
+        """What was put behind the label map meanwhile, such as the MRI of a case that was opened, stays afterwards."""
+        shown = composite.GetBackgroundVolumeID(), composite.GetForegroundVolumeID()
+        if any(shown):
+            self._volumes = (*shown, *self._volumes[2:])
+
     def restore(self, scene) -> None:
         slice_node, composite = scene.GetNodeByID(self._slice_id), scene.GetNodeByID(self._composite_id)
         if slice_node is None or composite is None:
             return
+        self.notice(composite)
         slice_node.GetSliceToRAS().DeepCopy(self._to_ras)
         slice_node.UpdateMatrices()
         slice_node.SetFieldOfView(*self._field_of_view)

@@ -63,6 +63,7 @@ class PlanningPanel:
         self._folder = tempfile.TemporaryDirectory(prefix="expected-appearances-")
         self._surfaces = Asking("surfaces", self._on_surface, urgent=True)
         session.surfaces = SegmentSurfaces(self._surfaces.ask)
+        self._left: list = []  # runs of cases that were open before this one
         self._ending: list = []  # runs of a closed scene that are being ended
         self._ending_timer = qt.QTimer()
         self._ending_timer.setInterval(500)
@@ -128,7 +129,10 @@ class PlanningPanel:
             return
         if self._followed != self.parameters.casePath:
             self._followed = self.parameters.casePath
-            self.sections["training"].close()  # forgets what the run of the case before has told
+            self.sections["training"].forget_run()
+            left = [run for run in self._going_on() if run.case_folder != Path(self._followed)]
+            self._end([run for run in left if run.poll().state is RunState.CANCELLING])
+            self._left = [run for run in left if run not in self._ending]
             for watch in self.runs.values():
                 watch.follow(self._followed)
         if not self.entered:
@@ -156,6 +160,10 @@ class PlanningPanel:
 
     def running(self) -> frozenset[str]:
         return frozenset(kind for kind, watch in self.runs.items() if watch.active)
+
+    def _going_on(self) -> list:
+        """Runs of this case, and of those that were open before in this scene."""
+        return going_on([*(watch.run for watch in self.runs.values()), *self._left])
 
     def busy(self) -> bool:
         """Whether something works on the case, which must then not be replaced."""
@@ -194,6 +202,8 @@ class PlanningPanel:
         """Nothing can be changed in the panel meanwhile."""
         widgets = [section.button for section in self.sections.values()]
         before, self.opening = self.ui.nextLabel.text, True
+        scan_before = self.parameters.mriVolume
+        self.sections["poses"].leave()  # what the slice view showed before it was looked through is that of this case
         try:
             for widget in widgets:
                 widget.enabled = False
@@ -209,9 +219,10 @@ class PlanningPanel:
             for widget in widgets:
                 widget.enabled = True
             self.ui.nextLabel.text, self.opening = before, False
+            self.refresh_soon()  # what is displayed as an error ends this, too
         self.refresh()
         yield
-        yield from self.sections["case"].showing_scan()
+        yield from self.sections["case"].showing_scan(scan_before)
         self.unfold(self._next)
 
     def _adopting(self, folder: str) -> Iterator[None]:
@@ -252,12 +263,9 @@ class PlanningPanel:
 
     def closing_scene(self) -> None:
         """Before the scene is closed: runs end or go on as the user chose, and every node is let go."""
-        active = going_on(watch.run for watch in self.runs.values())
-        if active and self._choice(ask=True) is OnClose.END:
-            for run in active:
-                run.cancel()
-            self._ending += active
-            self._ending_timer.start()
+        active, self._left = self._going_on(), []
+        if active and self._choice(active) is OnClose.END:
+            self._end(active)
         for watch in self.runs.values():
             watch.forget()
         self._followed = None
@@ -270,15 +278,20 @@ class PlanningPanel:
     def quitting(self) -> None:
         """Slicer ends: nobody can be asked any more, so what is not to be ended goes on."""
         if self.parameters is not None:
-            close_runs([watch.run for watch in self.runs.values()] + self._ending, self._choice(ask=False))
+            close_runs(self._going_on() + self._ending, OnClose(self.parameters.whenClosing.value))
 
-    def _choice(self, ask: bool) -> OnClose:
+    def _choice(self, active: list) -> OnClose:
         choice = OnClose(self.parameters.whenClosing.value) if self.parameters else OnClose.DETACH
-        if choice is not OnClose.ASK or not ask or slicer.app.testingEnabled():
+        if choice is not OnClose.ASK or slicer.app.testingEnabled():
             return choice
-        text = question(going_on(watch.run for watch in self.runs.values()))
-        goes_on = slicer.util.confirmYesNoDisplay(text, windowTitle=_("Let it go on?"))
+        goes_on = slicer.util.confirmYesNoDisplay(question(active), windowTitle=_("Let it go on?"))
         return OnClose.DETACH if goes_on else OnClose.END
+
+    def _end(self, runs: list) -> None:
+        for run in runs:
+            run.cancel()
+        self._ending += runs
+        self._ending_timer.start()
 
     def _poll_ending(self) -> None:
         self._ending = going_on(self._ending)

@@ -50,8 +50,9 @@ class PosesSection(Section):
         node = p.craniotomyNode if marked else None
         events = (node.PointModifiedEvent, node.PointRemovedEvent, node.TransformModifiedEvent) if node else ()
         self._watch.watch(node, *events)
-        for box in (ui.nearestSlider, ui.farthestSlider):
-            allow(box, _("Taken from the field of view; untick to set it.") if p.distanceAuto else "", "")
+        reason = _("Taken from the field of view; untick to set it.") if p.distanceAuto else ""
+        allow(ui.nearestSlider, reason, _("Nearest working distance."))
+        allow(ui.farthestSlider, reason, _("Farthest working distance."))
         reason = _("A quarter of the vessels' radius; untick to set it.") if p.lateralAuto else ""
         allow(ui.lateralSlider, reason, _("Largest distance of the point looked at from the craniotomy's centre."))
         with quiet(ui.poseSlider):
@@ -67,7 +68,8 @@ class PosesSection(Section):
         self._show_automatic(p, sampler)
         allow(ui.showCamerasCheck, problem, _("Draw the sampled cameras in the 3D view."))
         allow(ui.lookThroughCheck, problem, _("Show in the Red slice view what the camera would see."))
-        allow(ui.poseSlider, problem or ("" if p.lookThrough else _("Tick the box to look through a camera.")), "")
+        reason = problem or ("" if p.lookThrough else _("Tick the box to look through a camera."))
+        allow(ui.poseSlider, reason, _("Which camera is looked through."))
         self._refresh_cameras(p, sampler)
         self._looking.refresh(p if self.panel.entered and p.lookThrough else None, sampler)
         blocked = problem

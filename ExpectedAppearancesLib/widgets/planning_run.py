@@ -6,11 +6,13 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable
+from pathlib import Path
 
 import qt
 from slicer.i18n import tr as _
 
 from ..errors import ExpectedAppearancesError
+from ..runs.record import refuse_if_occupied
 from ..runs.runner import Run
 from ..runs.state import RunState, RunStatus, controls
 from .labels import set_text
@@ -134,6 +136,8 @@ def started(panel, watch: RunWatch, arguments: list[str], environment: dict[str,
     import slicer
 
     try:
+        # Also those of another Slicer or a shell, which the panel does not watch.
+        refuse_if_occupied(Path(panel.parameters.casePath), [kind for kind in GOING_ON if kind != watch.kind])
         watch.start(panel.parameters.casePath, arguments, environment)
     except ExpectedAppearancesError as error:
         slicer.util.errorDisplay(str(error), windowTitle=_("Not started"))

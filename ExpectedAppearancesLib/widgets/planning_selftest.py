@@ -320,6 +320,17 @@ def test_same_panel_after_the_scene_is_saved_and_opened(test) -> None:
         test.assertEqual(panel.ui.poseCountSpin.value, 17)
 
 
+def test_another_preset_or_method_brings_its_time_or_size(test) -> None:
+    panel = open_panel()
+    p, ui = panel.parameters, panel.ui
+    for index, chosen in ((1, ("best", 90.0)), (2, ("paper", 720.0)), (0, ("quick", 26.0))):
+        ui.presetCombo.currentIndex = index
+        test.assertEqual((p.preset.value, p.minutes, ui.presetCombo.currentIndex), (*chosen, index))
+    for index, chosen in ((1, ("image", 256)), (0, ("surface", 384))):
+        ui.methodCombo.currentIndex = index
+        test.assertEqual((p.method.value, p.sizePx, ui.sizeSpin.value), (*chosen, chosen[1]))
+
+
 def test_from_models_to_a_trained_model(test) -> None:
     """The whole quick workflow at its smallest, by clicks."""
     missing = dependencies.missing("training")

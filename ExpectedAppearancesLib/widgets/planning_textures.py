@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -163,7 +164,11 @@ class TexturesSection(Section):
         """A folder that photographs can be added to: the chosen one, else one in the case with the shipped textures."""
         p = self.parameters
         if p.texturesPath:
-            return True
+            writable = os.path.isdir(p.texturesPath) and os.access(p.texturesPath, os.W_OK)
+            if not writable:  # told now, not after the labelling
+                text = _("{folder}: you may not write into it. Choose a folder of your own, or the shipped textures.")
+                slicer.util.errorDisplay(text.format(folder=p.texturesPath))
+            return writable
         case = self.session.case(p)
         if case is None:
             slicer.util.errorDisplay(

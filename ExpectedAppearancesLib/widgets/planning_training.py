@@ -27,8 +27,7 @@ class TrainingSection(Section):
         self._gpus: list[Gpu] = []
         self._asked = None
         self._live: list[dict] = []  # told by the run since its last checkpoint
-        self._plotted: tuple | None = None
-        self._preset: str | None = None
+        self._plotted: tuple | None = None  # what the plot shows: case, number of points, last step
         self.controls = RunControls(
             self.panel.runs["train"],
             ui.trainingStart,
@@ -71,7 +70,12 @@ class TrainingSection(Section):
         return self.parameters.device if self.parameters.device in self._device_keys() else "auto"
 
     def close(self) -> None:
-        self._live, self._plotted = [], None
+        self.forget_run()
+        self._plotted = None
+
+    def forget_run(self) -> None:
+        """Another case is open: what a run of the one before has told is not its own."""
+        self._live = []
 
     def on_status(self, status: RunStatus) -> None:
         """Take what the run tells between two checkpoints."""
@@ -96,14 +100,17 @@ class TrainingSection(Section):
         options = ["--preset", p.preset.value, "--minutes", f"{p.minutes:g}", "--appearances", p.method.value]
         return [*options, *device], environment
 
-    def on_preset(self, _index: int) -> None:
+    def on_preset(self, index: int) -> None:
         """Each preset has a time of its own, which is taken over where the time was that of the preset before."""
         p = self.parameters
-        if p is None or self.panel.loading or self._preset == p.preset.value:
+        if p is None or self.panel.loading or index < 0:
             return
-        if self._preset is not None and math.isclose(p.minutes, PRESETS[self._preset].minutes):
-            p.minutes = PRESETS[p.preset.value].minutes
-        self._preset = p.preset.value
+        before, chosen = p.preset, list(type(p.preset))[index]
+        # Set here: its box is bound to it later than to this, and to set the time before would undo the choice.
+        if not changed(p, "preset", chosen):
+            return
+        if math.isclose(p.minutes, PRESETS[before.value].minutes):
+            p.minutes = PRESETS[chosen.value].minutes
 
     def on_device(self, index: int) -> None:
         keys = self._device_keys()
@@ -112,17 +119,22 @@ class TrainingSection(Section):
 
     def on_show_loss(self) -> None:
         """Draw the plot, and a layout with a plot view where there is none."""
-        curve = self._curve(self.session.case(self.parameters))
-        chart = charts.show_training(self.panel.scene, curve)
+        chart = self._draw(self._curve(self.session.case(self.parameters)))
         slicer.modules.plots.logic().ShowChartInLayout(chart)
 
     def _plot(self, curve: list[dict]) -> None:
         """Bring the plot up to date where there is one; it comes with the start, or when it is asked for."""
-        version = (len(curve), curve[-1]["step"]) if curve else None
-        if curve and version != self._plotted and charts.chart_of(self.panel.scene, "training.chart"):
-            self._plotted = version
+        other = self._version(curve) != self._plotted and (curve or self._plotted)  # nothing, after another case's
+        if other and charts.chart_of(self.panel.scene, "training.chart"):
             with slicer.util.RenderBlocker():
-                charts.show_training(self.panel.scene, curve)
+                self._draw(curve)
+
+    def _draw(self, curve: list[dict]):
+        self._plotted = self._version(curve)
+        return charts.show_training(self.panel.scene, curve)
+
+    def _version(self, curve: list[dict]) -> tuple:
+        return (self.parameters.casePath, len(curve), curve[-1]["step"] if curve else 0)
 
     def _curve(self, case) -> list[dict]:
         """What the last checkpoint holds, then what the run has told since."""

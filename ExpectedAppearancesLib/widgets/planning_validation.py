@@ -27,7 +27,7 @@ class ValidationSection(Section):
 
     def setup(self) -> None:
         ui = self.ui
-        self._shown: list | None = None  # rows of the table as it is in the scene
+        self._shown: tuple | None = None  # rows and limit of table and plot as they are in the scene
         self.controls = RunControls(
             self.panel.runs["study"],
             ui.studyStart,
@@ -53,8 +53,9 @@ class ValidationSection(Section):
             "" if rows else _("There are no figures yet: train the model, or start a study."),
             _("Show the table of figures, and the plot of the mean ADD of each texture."),
         )
-        if rows and rows != self._shown and charts.table_of(self.panel.scene):
-            self._fill(rows)  # it was shown before, and there are newer figures
+        other = (rows, self.parameters.addLimitMm) != self._shown and (rows or self._shown)
+        if other and charts.table_of(self.panel.scene):
+            self._fill(rows)  # it was shown before, and there are newer figures, or those of another case
         self.ui.verdictLabel.visible = bool(rows)
         if rows:
             self.ui.verdictLabel.text = self._verdict(rows)
@@ -108,8 +109,8 @@ class ValidationSection(Section):
 
     def _fill(self, rows: list) -> tuple:
         """Table and chart in the scene, with these figures."""
-        self._shown = rows
-        return charts.show_figures(self.panel.scene, rows, self.parameters.addLimitMm)
+        self._shown = (rows, self.parameters.addLimitMm)
+        return charts.show_figures(self.panel.scene, *self._shown)
 
     def _rows(self) -> list:
         case = self.session.case(self.parameters)
@@ -120,6 +121,8 @@ class ValidationSection(Section):
         shown = deciding(rows)
         head = _("Ready") if ready else _("Not ready")
         colour = READY_COLOUR if ready else NOT_READY_COLOUR
+        if self.panel.recorded.validation == "stale":
+            head, colour = _("Outdated: make the study again"), NOT_READY_COLOUR
         lines = [f'<b style="color:{colour}">{head}</b>']
         lines += [f"– {html.escape(reason)}" for reason in reasons]
         lines.append(
