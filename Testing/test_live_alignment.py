@@ -144,6 +144,12 @@ def test_vessels_are_seen_over_a_refused_frame_while_they_are_aligned_to_it(appl
         assert bool(live.backdrop.GetDisplayNode().GetVisibility()) == (apart_mm < 1e-3)
         return apart_mm < 1e-3
 
+    first = live.camera_to_world
+    controller.begin_alignment()
+    assert not np.allclose(live.camera_to_world, first)
+    controller.finish_alignment(keep=False)
+    # Others listen to that transform: what the alignment began with is nobody's pose.
+    np.testing.assert_allclose(live.camera_to_world, first, atol=1e-9)
     for _again in range(2):
         assert not is_seen()
         controller.begin_alignment()

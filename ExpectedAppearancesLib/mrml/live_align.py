@@ -24,6 +24,7 @@ class Alignment:
         self._live, self._case, self._scene = live_scene, case, live_scene._scene
         self._ras_from_world = RAS_FROM_LPS if case.space == "LPS" else np.eye(4)
         self._start = np.asarray(start, float)
+        self._before = inverse(inverse(self._ras_from_world) @ live_scene.camera_to_ras)
         live_scene.set_pose(self._start)
         live_scene.is_aligned_by_hand = True
         pivot_ras = transform(self._ras_from_world, case.vessels.centroid_mm[None])[0]
@@ -58,8 +59,9 @@ class Alignment:
         scenes.set_pose(self.handles, self._ras_from_world @ moved @ inverse(self._ras_from_world))
 
     def finish(self, keep: bool = True) -> np.ndarray:
-        """Put the vessels back to their place and, if kept, the camera to its; returns the pose."""
-        pose = self.camera_from_world if keep else self._start
+        """Put the vessels back to their place, and the camera to its, where it was unless that is kept; returns the
+        pose. A guess to begin with must not stay in the transform that others listen to."""
+        pose = self.camera_from_world if keep else self._before
         for name, node in self._live.models.items():
             if self._scene.IsNodePresent(node):
                 node.SetAndObserveTransformNodeID(self._parents[name])

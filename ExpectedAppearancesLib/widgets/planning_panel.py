@@ -209,6 +209,7 @@ class PlanningPanel:
                 widget.enabled = False
             self.ui.nextLabel.text = _(OPENING)
             yield
+            yield from loaded_for_runs()  # the refresh below would load them in one call
             with slicer.util.tryWithErrorDisplay(_("The case could not be opened.")):
                 case = yield from self._adopting(folder)
                 if case is None:
