@@ -2,41 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
-from test_extension import FOLDER, OPEN_THE_PANEL, ROOT
-
-# The stand-ins, without the planning panel that they are opened with there.
-OPEN_THE_LIVE_PANEL = (
-    OPEN_THE_PANEL.split("import ExpectedAppearances as module")[0]
-    + """
-import ExpectedAppearancesLive as module
-from ExpectedAppearancesLib.widgets.live_panel import LivePanel
-
-def parameter_node():
-    node = module.ExpectedAppearancesLiveParameterNode()
-    node.sourceNode = node.mriVolume = node.browser = None
-    node.connectGui = node.disconnectGui = MagicMock()
-    return node
-
-controller = MagicMock(running=False)
-panel = LivePanel(MagicMock(), controller)
-panel.set_parameter_node(parameter_node())
-"""
-)
-
-
-def in_the_panel(code: str, *arguments) -> None:
-    """Run `code` in a fresh interpreter in which `panel` is made; what it asserts must hold."""
-    command = [sys.executable, "-c", OPEN_THE_LIVE_PANEL + code, str(FOLDER), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.returncode == 0, done.stdout + done.stderr
+from panels import in_the_live_panel
 
 
 def test_the_camera_of_a_frame_is_remembered_in_each_scene():
     """A scene does not save where a view's principal point is, so a loaded one could not be shown without it."""
-    in_the_panel(
+    in_the_live_panel(
         """
 from ExpectedAppearancesLib.geometry.camera import Camera
 controller.camera = Camera(320, 240, 700.0, 690.0, 170.0, 108.0)
@@ -50,7 +21,7 @@ for scene in range(2):
 
 
 def test_why_the_sample_cannot_be_made_is_said_in_the_panel(tmp_path):
-    in_the_panel(
+    in_the_live_panel(
         """
 from pathlib import Path
 from ExpectedAppearancesLib.widgets import live_sample
@@ -65,7 +36,7 @@ assert "no folder" in panel._message, panel._message
 
 def test_the_overview_is_laid_out_for_each_case():
     """Two patients in turn: the second one's head may lie anywhere else."""
-    in_the_panel(
+    in_the_live_panel(
         """
 from types import SimpleNamespace
 from ExpectedAppearancesLib.live.status import Status
@@ -83,7 +54,7 @@ assert widget.threeDView().resetCamera.call_count == 2
 
 def test_a_landmark_that_was_not_picked_in_the_end_is_not_waited_for():
     """The next click made a new list of points in the patient's scene."""
-    in_the_panel(
+    in_the_live_panel(
         """
 slicer.app = MagicMock()
 interaction = slicer.app.applicationLogic().GetInteractionNode()
