@@ -159,9 +159,9 @@ class ExpectedAppearancesParameterNode:
     minutes: Annotated[float, WithinRange(0.1, 10000)] = 26.0
 
     studyProtocols: StudyProtocols = StudyProtocols.BOTH
-    addLimitMm: Annotated[float, WithinRange(0.1, 100)] = 3.0
-    accuracyLimitPercent: Annotated[float, WithinRange(0, 100)] = 80.0
-    acceptedLimitPercent: Annotated[float, WithinRange(0, 100)] = 50.0
+    acceptedAddLimitMm: Annotated[float, WithinRange(0.1, 100)] = 1.5
+    acceptedRightLimitPercent: Annotated[float, WithinRange(0, 100)] = 97.0
+    acceptedLimitPercent: Annotated[float, WithinRange(0, 100)] = 30.0
 
     whenClosing: WhenClosing = WhenClosing.ASK
 

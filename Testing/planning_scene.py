@@ -76,9 +76,14 @@ def parameters(**values) -> SimpleNamespace:
     usual |= dict(distanceAuto=True, nearestMm=80.0, farthestMm=140.0, lateralAuto=True, lateralMm=3.0)
     usual |= dict(inViewPercent=60.0, poseCount=4, seed=0, texturesPath="", method=How.SURFACE, sizePx=384)
     usual |= dict(
-        iterations=50, preset=Preset.QUICK, minutes=26.0, mriVolume=None, addLimitMm=3.0, acceptedLimitPercent=50.0
+        iterations=50,
+        preset=Preset.QUICK,
+        minutes=26.0,
+        mriVolume=None,
+        acceptedAddLimitMm=1.5,
+        acceptedLimitPercent=30.0,
     )
-    return SimpleNamespace(**(usual | dict(accuracyLimitPercent=80.0) | values))
+    return SimpleNamespace(**(usual | dict(acceptedRightLimitPercent=97.0) | values))
 
 
 def save(session, p, folder) -> Case:

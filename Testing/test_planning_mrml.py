@@ -225,7 +225,7 @@ def test_photograph_and_labels_survive_the_segment_editors_form(scene):
     assert (labelling.labels_of(nodes) == 1).all()
 
 
-SHARES = ("Within 3 mm, 3° (%)", "ADD below 3 mm (%)")
+SHARES = ("Within 3 mm, 3° (%)", "Accepted below 3 mm (%)")
 
 
 def test_plots_are_found_again_and_filled_anew(scene):
@@ -240,12 +240,12 @@ def test_plots_are_found_again_and_filled_anew(scene):
     assert rows == {"Validation ADD (mm)": 2, "Loss": 2}
     charts.show_training(scene, [])
     assert [series[name].GetTableNode().GetNumberOfRows() for name in rows] == [0, 0]
-    table, chart = charts.show_figures(scene, [Figures("strict", "a", *[1.0] * 6)], 3.0)
+    table, chart = charts.show_figures(scene, [Figures("strict", "a", *[1.0] * 8)], 3.0)
     assert (table.GetNumberOfRows(), chart.GetNumberOfPlotSeriesNodes()) == (1, 1)
-    own = Figures(OWN_VALIDATION, "", *[0.5] * 6)
-    charts.show_figures(scene, [Figures("strict", "a", *[1.0] * 6), own], 3.0)
+    own = Figures(OWN_VALIDATION, "", accepted_add_mm=0.5, accepted_right=0.5)
+    charts.show_figures(scene, [Figures("strict", "a", *[1.0] * 8), own], 3.0)
     shares = [[table.GetCellText(i, table.GetColumnIndex(name)) for i in range(2)] for name in SHARES]
-    assert shares == [["100.00", ""], ["", "50.00"]]  # each under its own name
+    assert shares == [["100.00", ""], ["100.00", "50.00"]]
     assert charts.show_figures(scene, [], 3.0) == (table, chart)
     assert (table.GetNumberOfRows(), chart.GetNumberOfPlotSeriesNodes()) == (0, 0)
 

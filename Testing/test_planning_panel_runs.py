@@ -59,7 +59,7 @@ def test_the_verdict_names_the_test_that_it_rests_on():
 from ExpectedAppearancesLib.case.recorded import Recorded
 from ExpectedAppearancesLib.evaluation.verdict import OWN_VALIDATION, Figures
 panel.recorded = Recorded(verdict=(True, ()))
-loto, own, strict = (Figures(name, "", *[1.0] * 6) for name in ("loto", OWN_VALIDATION, "strict"))
+loto, own, strict = (Figures(name, "", *[1.0] * 8) for name in ("loto", OWN_VALIDATION, "strict"))
 for rows, words in (([loto, own], "own validation"), ([strict, loto, own], "unseen texture and pose")):
     assert words in panel.sections["validation"]._verdict(rows), panel.sections["validation"]._verdict(rows)
     assert ">Ready<" in panel.sections["validation"]._verdict(rows)
@@ -169,10 +169,10 @@ training.on_show_loss()
 validation.on_show()
 panel.open_folder("new")
 assert drawn["loss"] == drawn["figures"] == []
-p.addLimitMm = 2.0
+p.acceptedAddLimitMm = 2.0
 panel.open_folder("first")
 assert drawn["limit"] == 2.0
-p.addLimitMm = 1.5
+p.acceptedAddLimitMm = 1.5
 panel.refresh()
 assert drawn["limit"] == 1.5
 """

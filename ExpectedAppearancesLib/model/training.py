@@ -246,6 +246,7 @@ class _Trainer:
         probability = np.array([confidence.probability(r.evidence) for r in readings])
         accepted = probability >= confidence.threshold
         covariance = self._covariance(readings, calibration, positive, probability, confidence.threshold)
+        shown_add = errors[accepted & positive]
         held_out_add = self._add(self._read(validation), validation)
         figures = {
             "add_mm_mean": round(float(held_out_add.mean()), 4),
@@ -254,6 +255,7 @@ class _Trainer:
             "accepted_of_true": round(float(accepted[positive].mean()), 4),
             "accepted_of_false": round(float(accepted[~positive].mean()), 4) if (~positive).any() else None,
             "accepted_add_below_3mm": round(float(good[accepted].mean()), 4) if accepted.any() else None,
+            "accepted_add_mm_mean": round(float(shown_add.mean()), 4) if shown_add.size else None,
             "calibration_error": round(calibration_error(probability, good), 4),
             "steps": self.state["step"],
             "seconds": round(self.state["seconds"], 1),

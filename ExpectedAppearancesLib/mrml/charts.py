@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..evaluation.verdict import OWN_VALIDATION, PROTOCOL_NAMES, Figures
+from ..evaluation.verdict import PROTOCOL_NAMES, Figures
 
 ROLE_ATTRIBUTE = "ExpectedAppearances.Role"
 LOSS_COLOUR, ADD_COLOUR = (0.35, 0.35, 0.35), (0.05, 0.45, 0.75)
@@ -21,8 +21,9 @@ FIGURE_COLUMNS = (
     ("ADD 95th percentile (mm)", "add_mm_p95", 1.0),
     ("Within 3 mm, 3° (%)", "accuracy_3", 100.0),
     ("Within 5 mm, 5° (%)", "accuracy_5", 100.0),
-    ("ADD below 3 mm (%)", "add_below_3", 100.0),
     ("Accepted (%)", "accepted", 100.0),
+    ("ADD mean of accepted (mm)", "accepted_add_mm", 1.0),
+    ("Accepted below 3 mm (%)", "accepted_right", 100.0),
 )
 
 
@@ -54,14 +55,15 @@ def show_training(scene, curve: Sequence[dict]):
 
 
 def show_figures(scene, rows: Sequence[Figures], limit_mm: float):
-    """The validation's figures: (vtkMRMLTableNode of all rows, vtkMRMLPlotChartNode of the mean ADD of each style)."""
+    """The validation's figures: (vtkMRMLTableNode of all rows, vtkMRMLPlotChartNode of the mean ADD of what
+    was accepted of each style)."""
     table = _node(scene, "vtkMRMLTableNode", "validation.table", "Validation")
     columns: dict[str, list] = {
         "Test": [PROTOCOL_NAMES.get(row.protocol, row.protocol) for row in rows],
         "Texture": [row.style or "all" for row in rows],
     }
     for title, key, factor in FIGURE_COLUMNS:
-        values = [_figure(row, key) for row in rows]
+        values = [getattr(row, key) for row in rows]
         columns[title] = ["" if value is None else f"{factor * value:.2f}" for value in values]
     _fill(table, columns)
     table.SetUseColumnTitleAsColumnHeader(True)
@@ -69,11 +71,11 @@ def show_figures(scene, rows: Sequence[Figures], limit_mm: float):
     protocols = list(dict.fromkeys(row.protocol for row in rows))
     series_nodes = []
     for protocol, colour in zip(protocols, BAR_COLOURS):
-        shown = [row for row in rows if row.protocol == protocol and row.add_mm_mean is not None]
+        shown = [row for row in rows if row.protocol == protocol and row.accepted_add_mm is not None]
         shown = [row for row in shown if row.style] or shown
         title = PROTOCOL_NAMES.get(protocol, protocol)
         data = _node(scene, "vtkMRMLTableNode", f"validation.{protocol}.table", f"Validation: {title}")
-        _fill(data, {"Texture": [row.style or "all" for row in shown], title: [row.add_mm_mean for row in shown]})
+        _fill(data, {"Texture": [row.style or "all" for row in shown], title: [row.accepted_add_mm for row in shown]})
         series = _node(scene, "vtkMRMLPlotSeriesNode", f"validation.{protocol}.series", title)
         series.SetAndObserveTableNodeID(data.GetID())
         series.SetPlotType(series.PlotTypeBar)
@@ -81,16 +83,8 @@ def show_figures(scene, rows: Sequence[Figures], limit_mm: float):
         series.SetLabelColumnName("Texture")
         series.SetColor(*colour)
         series_nodes.append(series)
-    title = f"Mean ADD of each texture (limit {limit_mm:.1f} mm)"
+    title = f"Mean ADD of accepted views of each texture (limit {limit_mm:.1f} mm)"
     return table, _chart(scene, "validation.chart", title, "Texture", "ADD (mm)", series_nodes)
-
-
-def _figure(row: Figures, key: str) -> float | None:
-    """A model's own validation tells another share than a study, under the same name."""
-    own = row.protocol == OWN_VALIDATION
-    if key == "add_below_3":
-        return row.accuracy_3 if own else None
-    return None if own and key == "accuracy_3" else getattr(row, key)
 
 
 def chart_of(scene, role: str):

@@ -272,9 +272,8 @@ class PlanningSession:
             yield
 
     def limits(self, parameters) -> Limits:
-        return Limits(
-            parameters.addLimitMm, parameters.acceptedLimitPercent / 100, parameters.accuracyLimitPercent / 100
-        )
+        p = parameters
+        return Limits(p.acceptedAddLimitMm, p.acceptedRightLimitPercent / 100, p.acceptedLimitPercent / 100)
 
     def scan_to_keep(self, parameters) -> dict | None:
         """Identity of the chosen MRI where the saved case does not hold it yet; None where nothing is to be done."""

@@ -247,13 +247,14 @@ def test_verdict_follows_the_limits(test) -> None:
         p = panel.parameters
         case = saved_case(test, panel, folder)
         test.assertTrue(panel.ui.showFiguresButton.toolTip)
-        figures = {"add_mm_mean": 2.4, "add_mm_median": 2.0, "add_below_3mm": 0.9, "accepted_of_true": 0.7}
+        figures = {"add_mm_mean": 2.4, "accepted_of_true": 0.7, "accepted_add_mm_mean": 0.8}
+        figures |= {"accepted_add_below_3mm": 0.99}
         files.write_json(case.model_folder / "model.json", {"validation": figures})
         panel.refresh()
         test.assertIn(">Ready<", panel.ui.verdictLabel.text)
-        p.addLimitMm = 2.0
+        p.acceptedAddLimitMm = 0.7
         wait_until(test, lambda: "Not ready" in panel.ui.verdictLabel.text)
-        test.assertIn("2.40 mm", panel.ui.verdictLabel.text)
+        test.assertIn("0.80 mm", panel.ui.verdictLabel.text)
         panel.ui.showFiguresButton.click()
         table = charts.table_of(slicer.mrmlScene)
         test.assertEqual(table.GetCellText(0, table.GetColumnIndex("ADD mean (mm)")), "2.40")

@@ -51,9 +51,9 @@ class ValidationSection(Section):
         allow(
             self.ui.showFiguresButton,
             "" if rows else _("There are no figures yet: train the model, or start a study."),
-            _("Show the table of figures, and the plot of the mean ADD of each texture."),
+            _("Show the table of figures, and the plot of the mean ADD of accepted views of each texture."),
         )
-        other = (rows, self.parameters.addLimitMm) != self._shown and (rows or self._shown)
+        other = (rows, self.parameters.acceptedAddLimitMm) != self._shown and (rows or self._shown)
         if other and charts.table_of(self.panel.scene):
             self._fill(rows)  # it was shown before, and there are newer figures, or those of another case
         self.ui.verdictLabel.visible = bool(rows)
@@ -109,7 +109,7 @@ class ValidationSection(Section):
 
     def _fill(self, rows: list) -> tuple:
         """Table and chart in the scene, with these figures."""
-        self._shown = (rows, self.parameters.addLimitMm)
+        self._shown = (rows, self.parameters.acceptedAddLimitMm)
         return charts.show_figures(self.panel.scene, *self._shown)
 
     def _rows(self) -> list:
