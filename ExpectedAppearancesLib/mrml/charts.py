@@ -15,15 +15,15 @@ from ..evaluation.verdict import PROTOCOL_NAMES, Figures
 ROLE_ATTRIBUTE = "ExpectedAppearances.Role"
 LOSS_COLOUR, ADD_COLOUR = (0.35, 0.35, 0.35), (0.05, 0.45, 0.75)
 BAR_COLOURS = ((0.05, 0.45, 0.75), (0.85, 0.55, 0.15), (0.4, 0.6, 0.35))
-FIGURE_COLUMNS = (
+FIGURE_COLUMNS = (  # first those that the verdict rests on
+    ("Accepted (%)", "accepted", 100.0),
+    ("ADD mean of accepted (mm)", "accepted_add_mm", 1.0),
+    ("Accepted below 3 mm (%)", "accepted_right", 100.0),
     ("ADD mean (mm)", "add_mm_mean", 1.0),
     ("ADD median (mm)", "add_mm_median", 1.0),
     ("ADD 95th percentile (mm)", "add_mm_p95", 1.0),
     ("Within 3 mm, 3° (%)", "accuracy_3", 100.0),
     ("Within 5 mm, 5° (%)", "accuracy_5", 100.0),
-    ("Accepted (%)", "accepted", 100.0),
-    ("ADD mean of accepted (mm)", "accepted_add_mm", 1.0),
-    ("Accepted below 3 mm (%)", "accepted_right", 100.0),
 )
 
 
@@ -83,7 +83,7 @@ def show_figures(scene, rows: Sequence[Figures], limit_mm: float):
         series.SetLabelColumnName("Texture")
         series.SetColor(*colour)
         series_nodes.append(series)
-    title = f"Mean ADD of accepted views of each texture (limit {limit_mm:.1f} mm)"
+    title = f"Mean ADD of accepted views (limit {limit_mm:.1f} mm)"
     return table, _chart(scene, "validation.chart", title, "Texture", "ADD (mm)", series_nodes)
 
 
