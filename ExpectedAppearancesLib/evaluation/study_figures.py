@@ -60,7 +60,7 @@ def write_texture_counts(path: Path, studies: Mapping[str, Sequence[Mapping]]) -
         right.plot(counts, shares, "o-", color=colour, label=label)
     for axes, name in ((left, "ADD mean, mm"), (right, "within 3 mm and 3 degrees, %")):
         axes.set(xlabel="training textures", ylabel=name)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(alpha=0.3)
     if len(studies) > 1:
