@@ -141,9 +141,13 @@ def refuse_if_occupied(folder: Path, kinds: Iterable[str] = tuple(NAMES)) -> Non
     if importlib.util.find_spec("filelock") is None:
         return
     for kind in kinds:
-        if os.path.exists(_lock_path(folder, kind)):  # in a case that cannot be written there is none to be made
-            with exclusive(folder, kind):
-                pass
+        path = _lock_path(folder, kind)
+        if os.path.exists(path):  # in a case that cannot be written there is none to be made
+            with files.writing(path):
+                lock = _locked(path, 0.0)
+            if lock is None:
+                raise InputError(_occupied(folder, kind, _holder(path)))
+            lock.release()
 
 
 def _lock_path(folder: Path, name: str) -> Path:
