@@ -329,6 +329,15 @@ def test_a_run_of_a_case_is_not_taken_for_one_of_its_copy_and_follows_it_when_it
     assert found.wait(DEADLINE_S).state is RunState.CANCELLED
 
 
+def test_the_copy_of_a_case_whose_drive_is_gone_is_worked_on(case, vanish):
+    """Its record still names the folder on the drive."""
+    start(case, "done").wait(DEADLINE_S)
+    copy = case.with_name("copy")
+    shutil.copytree(case, copy)
+    vanish(case)
+    assert record.read_record(copy, "synthesize").outcome == "done"
+
+
 def test_a_later_process_learns_once_that_a_run_has_crashed(case):
     elsewhere(case, "start", "crash")
     state, _, code, problem = elsewhere(case, "wait")

@@ -74,7 +74,7 @@ def read_record(case_folder: Path, kind: str) -> RunRecord | None:
 
 def _is_of_another_case(record: RunRecord, case_folder: Path) -> bool:
     """Whether the run works on another folder, of which this one is a copy; not where that was moved to here."""
-    worked_on = [Path(word) for word in record.command if (Path(word) / "case.json").is_file()]
+    worked_on = [word for word in record.command if os.path.isfile(Path(word) / "case.json")]
     return bool(worked_on) and not any(os.path.samefile(folder, case_folder) for folder in worked_on)
 
 
