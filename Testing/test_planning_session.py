@@ -18,6 +18,7 @@ from ExpectedAppearancesLib.case import recorded
 from ExpectedAppearancesLib.case.steps import Step, StepState
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import read_camera
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 from ExpectedAppearancesLib.runs.worker import Worker
 
 slicer = pytest.importorskip("slicer")
@@ -169,6 +170,21 @@ def test_a_craniotomy_that_was_marked_is_kept_when_the_case_is_opened(scene, pla
     # Saved anew, as with another microscope, the case has none: a fitted one must not pass for the one that was marked.
     other.casePath = str(tmp_path / "anew")
     assert "No craniotomy is saved" in session.steps(other)["poses"].text
+
+
+def test_a_craniotomy_that_is_drawn_again_is_the_very_same(planned, tmp_path):
+    """A training or study that was stopped begins anew where its poses are drawn around another one."""
+    session, p = planned
+    case = save(session, p, tmp_path)
+    p.casePath, p.craniotomySource = str(case.folder), Where.RECORDED
+    for point, axis in np.random.default_rng(1).normal(size=(20, 2, 3)) * 1e-5:
+        first = find_craniotomy(case.vessels, None, "LPS", point, axis)
+        case.record("render", craniotomy={key: value.tolist() for key, value in vars(first).items()})
+        words = session.render_arguments(p)
+        point, axis = ([float(word) for word in words[words.index(w) + 1 :][:3]] for w in ("--point", "--normal"))
+        again = find_craniotomy(case.vessels, None, "LPS", point, axis)
+        assert all(np.array_equal(value, vars(first)[key]) for key, value in vars(again).items())
+        assert not any("e" in word for word in words if not word.startswith("--"))
 
 
 def test_a_craniotomy_marked_on_another_patient_is_not_kept(scene, planned, tmp_path):
