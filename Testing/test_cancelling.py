@@ -15,6 +15,7 @@ import pytest
 from ExpectedAppearancesLib.cancelling import cancelling_waits
 from ExpectedAppearancesLib.cli import main, termination_cancels
 from ExpectedAppearancesLib.errors import CancelledError, InputError
+from ExpectedAppearancesLib.runs import record
 from ExpectedAppearancesLib.runs.environment import library_environment
 from ExpectedAppearancesLib.runs.record import (
     LOOK_EVERY_S,
@@ -106,6 +107,16 @@ def test_who_holds_the_lock_is_named_and_a_killed_one_holds_nothing(tmp_path, ho
     with exclusive(tmp_path, "train"), pytest.raises(InputError, match=own), exclusive(tmp_path, "train"):
         pass
     assert not list(runs_folder(tmp_path).glob("*.json"))
+
+
+def test_who_looks_whether_a_case_is_free_is_not_taken_for_one_who_works_on_it(tmp_path, holder, monkeypatch):
+    """A training that begins at that moment waits for the lock, unless somebody is named as its holder."""
+    monkeypatch.setattr(record, "_write_holder", lambda *_: pytest.fail("named as the holder"))
+    with pytest.raises(InputError, match=rf"a training is going on in it \(process {holder.pid}"):
+        record.refuse_if_occupied(tmp_path)
+    holder.kill()
+    holder.wait()
+    record.refuse_if_occupied(tmp_path)
 
 
 def test_only_the_same_work_is_shared(tmp_path, holder):

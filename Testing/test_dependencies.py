@@ -19,7 +19,7 @@ from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.runs import dependencies
 from ExpectedAppearancesLib.runs.dependencies import InstallError, Package
 from ExpectedAppearancesLib.runs.pip_words import explanation
-from ExpectedAppearancesLib.runs.system_report import SystemCheck
+from ExpectedAppearancesLib.runs.system_report import SystemCheck, system_report
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "expected-appearances-test-package"
@@ -245,7 +245,7 @@ def test_torch_comes_through_its_extension_except_from_a_folder(slicer, monkeypa
 
 def test_report_for_a_mail_holds_what_check_says_and_slicers_version(slicer, monkeypatch):
     monkeypatch.setattr(check, "_run_python", lambda _source: (0, "[]", ""))
-    report = dependencies.system_report()
+    report = system_report(check.make_report())
     monkeypatch.undo()
     assert report.startswith("3D Slicer 5.8.1 (revision 33241, linux-amd64)")
     assert f"Package numpy: {metadata.version('numpy')}" in report

@@ -172,6 +172,17 @@ def test_what_is_missing_or_damaged_is_told(scene, planned, case):
     assert session.scan_to_keep(p) is not None  # chosen again, it is kept again
 
 
+def test_the_scan_of_the_case_before_is_not_chosen_for_one_that_cannot_be_opened(scene, planned, case):
+    """Once its file is restored, Save would put another patient's scan into it."""
+    session, p = planned
+    p.mriVolume = volume(scene, "another patient's")
+    vessels = case.folder / "vessels.vtp"
+    vessels.rename(case.folder / "elsewhere.vtp")
+    assert adopt(session, p, scene) is None
+    (case.folder / "elsewhere.vtp").rename(vessels)
+    assert session.case(p) and session.scan_to_keep(p) is None
+
+
 def test_the_live_panel_shows_the_scan_of_its_case(scene, case):
     assert mri.scan_to_show(scene, case, None) is None
     chosen = volume(scene, "chosen by the user", 5)

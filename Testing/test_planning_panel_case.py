@@ -225,6 +225,25 @@ assert first.wait.called and second.wait.called
     )
 
 
+def test_a_run_that_is_being_cancelled_is_seen_to_its_end_when_the_scene_is_closed():
+    """Nobody is asked whether it goes on: it cannot, and who ends it by the deadline is the panel."""
+    in_the_panel(
+        """
+from ExpectedAppearancesLib.runs.state import RunState, RunStatus
+panel._choice = lambda runs: module.WhenClosing.DETACH if [run.kind for run in runs] == ["train"] else 1 / 0
+for kind, state in (("train", RunState.RUNNING), ("render", RunState.CANCELLING)):
+    panel.runs[kind].run = MagicMock(kind=kind)
+    panel.runs[kind].run.poll.return_value = RunStatus(state)
+cancelled = panel.runs["render"].run
+panel.closing_scene()
+assert panel._ending == [cancelled] and panel._ending_timer.start.called
+panel._ending, panel.runs["render"].run = [], cancelled
+panel.closing_scene()
+assert panel._ending == [cancelled]
+"""
+    )
+
+
 def test_the_scan_of_the_case_before_is_not_seen_behind_a_case_without_one():
     in_the_panel(
         """

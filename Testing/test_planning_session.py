@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-import sys
-import time
-from collections import Counter
 from dataclasses import replace
 
 import cases
 import numpy as np
 import pytest
 
-from ExpectedAppearancesLib import files
-from ExpectedAppearancesLib.appearances import store
-from ExpectedAppearancesLib.appearances.overview import overview_view
-from ExpectedAppearancesLib.case import recorded
-from ExpectedAppearancesLib.case.steps import Step, StepState
-from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.case.steps import StepState
 from ExpectedAppearancesLib.geometry.camera import read_camera
-from ExpectedAppearancesLib.runs.worker import Worker
+from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 
-slicer = pytest.importorskip("slicer")
-import vtk  # noqa: E402 (after the skip)
-from planning_scene import LPS, Source, Where, add_transform, new_scene, parameters, save, turned  # noqa: E402
-from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
+pytest.importorskip("slicer")
+import vtk
+from planning_scene import LPS, Source, Where, add_transform, new_scene, parameters, save, turned
 
-from ExpectedAppearancesLib.mrml import mri, planning, planning_session  # noqa: E402
-from ExpectedAppearancesLib.mrml.planning_adopt import adopt, adopting  # noqa: E402
-from ExpectedAppearancesLib.mrml.segment_surface import SegmentSurfaces, answering  # noqa: E402
+from ExpectedAppearancesLib.mrml.planning_adopt import adopt, adopting
 
 
 def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):
@@ -171,6 +160,21 @@ def test_a_craniotomy_that_was_marked_is_kept_when_the_case_is_opened(scene, pla
     assert "No craniotomy is saved" in session.steps(other)["poses"].text
 
 
+def test_a_craniotomy_that_is_drawn_again_is_the_very_same(planned, tmp_path):
+    """A training or study that was stopped begins anew where its poses are drawn around another one."""
+    session, p = planned
+    case = save(session, p, tmp_path)
+    p.casePath, p.craniotomySource = str(case.folder), Where.RECORDED
+    for point, axis in np.random.default_rng(1).normal(size=(20, 2, 3)) * 1e-5:
+        first = find_craniotomy(case.vessels, None, "LPS", point, axis)
+        case.record("render", craniotomy={key: value.tolist() for key, value in vars(first).items()})
+        words = session.render_arguments(p)
+        point, axis = ([float(word) for word in words[words.index(w) + 1 :][:3]] for w in ("--point", "--normal"))
+        again = find_craniotomy(case.vessels, None, "LPS", point, axis)
+        assert all(np.array_equal(value, vars(first)[key]) for key, value in vars(again).items())
+        assert not any("e" in word for word in words if not word.startswith("--"))
+
+
 def test_a_craniotomy_marked_on_another_patient_is_not_kept(scene, planned, tmp_path):
     session, p = planned
     p.casePath = str(save(session, p, tmp_path).folder)
@@ -263,251 +267,3 @@ def test_microscope_from_its_field_of_view(planned):
     camera = session.camera(p)
     assert camera.width / camera.fx * 300.0 == pytest.approx(40.0)
     assert read_camera(p.calibrationPath) == session.camera(parameters(calibrationPath=p.calibrationPath))
-
-
-@pytest.fixture
-def counted(monkeypatch):
-    """How often each thing that costs was done since the last look."""
-    done = Counter()
-
-    def count(module, name):
-        usual = getattr(module, name)
-
-        def noted(*arguments, **named):
-            done[name] += 1
-            return usual(*arguments, **named)
-
-        noted.__name__ = name
-        monkeypatch.setattr(module, name, noted)
-
-    for module, name in (
-        (files, "sha256"),
-        (files, "read_json"),
-        (recorded, "overview_changed"),
-        (recorded, "training_state"),
-        (recorded, "newest_image"),
-        (planning, "world_mesh"),
-        (planning, "same_mesh"),
-        (planning_session, "find_craniotomy"),
-        (planning_session, "PoseSampler"),
-        (mri, "scan_identity"),
-    ):
-        count(module, name)
-
-    def look() -> dict:
-        found = dict(done)
-        done.clear()
-        return found
-
-    return look
-
-
-def test_a_refresh_does_only_what_has_changed(scene, planned, tmp_path, counted):
-    """Ticks of the panel's timer must stay cheap however large the case is, so work is counted, not timed."""
-    session, p = planned
-    p.casePath = str(tmp_path / "case")
-    case = save(session, p, tmp_path)
-    case.record("render", **session.pose_settings(p), circular_field=None, done=True)
-    camera, pose = overview_view(session.craniotomy(p), case.cortex, 64)
-    item = {"style": "a", "image": "a.png", "texture_sha256": "", "camera_from_world": pose.tolist()}
-    settings = {"size_px": 384, "iterations": 50, "overview": pose.tolist()}
-    store.write_index(case, "surface", camera, settings, [item] * 500, done=True)
-    (case.model_folder).mkdir()
-    (case.model_folder / "checkpoint.safetensors").write_bytes(b"")
-
-    def tick():
-        record = session.recorded(p)
-        session.steps(p, frozenset({"train"}), record)
-        session.reader.curve(session.case(p))
-        session.reader.newest_image(session.case(p), "surface")
-        return counted()
-
-    assert tick()["overview_changed"] == 1
-    assert [tick() for _ in range(5)] == [{}] * 5
-    case.record("train", done=False)
-    counted()  # what writing reads
-    assert tick() == {"read_json": 2}  # the manifest and the camera; nothing is hashed again
-    (case.model_folder / "checkpoint.safetensors").write_bytes(b"12345678")
-    assert tick() == {"training_state": 1}
-    (case.appearances_folder / "surface" / "b.png").touch()
-    assert tick() == {"newest_image": 1}
-    p.tiltMaxDeg = 40.0
-    assert tick() == {"PoseSampler": 1}
-    p.vesselsNode.SetAndObserveTransformNodeID(None)
-    moved = tick()
-    # They are now so far off that another part of the cortex is near them: its axis is found, then the centre.
-    assert moved == {"world_mesh": 1, "same_mesh": 1, "find_craniotomy": 2, "PoseSampler": 1}
-    store.write_index(case, "surface", camera, settings, [item] * 501, done=True)
-    assert tick() == {"read_json": 1, "sha256": 1, "overview_changed": 1, "newest_image": 1}
-
-
-def test_prepared_in_pieces_it_answers_at_once(scene, planned, tmp_path, counted):
-    session, p = planned
-    p.casePath = str(tmp_path / "case")
-    save(session, p, tmp_path)
-    p.vesselsNode.GetPolyData().Modified()
-    counted()
-    done = []
-    for _piece in session.prepare(p):
-        done.append(counted())
-    assert max(len(piece) for piece in done) <= 2 and sum(piece.get("world_mesh", 0) for piece in done) == 1
-    session.steps(p)
-    assert counted() == {}
-    p.vesselsNode.SetAndObservePolyData(vtk.vtkPolyData())
-    list(session.prepare(p))  # what is wrong is said by the steps
-    assert session.steps(p)["poses"].state is StepState.MISSING
-
-
-def test_the_surface_of_a_segment_comes_from_a_process_and_an_outdated_one_never(scene, planned, tmp_path):
-    session, p = planned
-    image = slicer.vtkOrientedImageData()
-    image.SetExtent(3, 14, -2, 9, 0, 11)
-    image.SetSpacing(2.0, 1.0, 0.5)
-    image.SetOrigin(5.0, -7.0, 11.0)
-    image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
-    voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(12, 12, 12)
-    voxels[:] = 0
-    voxels[3:8, 3:7, 3:9] = 1
-    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "S")
-    node.CreateDefaultDisplayNodes()
-    segment_id = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
-    node.SetAndObserveTransformNodeID(add_transform(scene, turned()).GetID())
-    expected = planning.world_mesh(node, segment_id)
-    p.vesselsSegmentId, p.vesselsNode = segment_id, node
-
-    asked: list[dict] = []
-    worker, session.surfaces = Worker("surfaces"), SegmentSurfaces(asked.append)
-
-    def answered() -> tuple[dict, dict]:
-        list(session.surfaces.asking(node, segment_id, tmp_path))
-        worker.ask(asked[-1])
-        end = time.monotonic() + 300
-        while not (found := worker.poll()):
-            assert time.monotonic() < end
-            time.sleep(0.02)
-        return found
-
-    def draw() -> None:
-        segment = node.GetSegmentation().GetSegment(segment_id)
-        segment.GetRepresentation(node.GetSegmentation().GetSourceRepresentationName()).Modified()
-
-    try:
-        assert session.steps(p)["case"] == Step(StepState.RUNNING, "The surface of the segment is being made.")
-        with pytest.raises(InputError, match="is being made"):
-            session.mesh(p, "vessels")
-        first = answered()
-        assert not session.surfaces.to_ask(node, segment_id)
-        session.surfaces.take(*first)
-        made = session.mesh(p, "vessels")
-        np.testing.assert_allclose(made.vertices_mm, expected.vertices_mm, atol=1e-4)
-        np.testing.assert_array_equal(made.triangles, expected.triangles)
-        assert session.steps(p)["case"].state is StepState.MISSING  # a folder is to be chosen: nothing is waited for
-
-        draw()
-        assert session.surfaces.to_ask(node, segment_id)
-        assert session.mesh(p, "vessels") is made  # what is drawn in the views stays until the new one comes
-        assert session.steps(p)["case"].state is StepState.RUNNING
-        outdated = answered()
-        draw()
-        voxels[:] = 0
-        newest = answered()
-        session.surfaces.take(*outdated)
-        assert session.steps(p)["case"].state is StepState.RUNNING
-        session.surfaces.take(*newest)
-        with pytest.raises(InputError, match="S: "):
-            session.mesh(p, "vessels")
-
-        draw()
-        voxels[4:9, 4:8, 4:9] = 1
-        list(session.surfaces.asking(node, segment_id, tmp_path))
-        session.surfaces.take(asked[-1], {"failed": "ended"})
-        np.testing.assert_array_equal(
-            session.mesh(p, "vessels").vertices_mm, planning.world_mesh(node, segment_id).vertices_mm
-        )
-    finally:
-        worker.stop()
-
-
-def test_a_segment_is_taken_with_the_smoothing_that_is_set_for_its_surface(scene, planned, tmp_path):
-    """In the Segment Editor's menu of Show 3D: thin vessels vanish where they are smoothed much."""
-    session, p = planned
-    image = slicer.vtkOrientedImageData()
-    image.SetExtent(0, 19, 0, 19, 0, 19)
-    image.AllocateScalars(vtk.VTK_UNSIGNED_CHAR, 1)
-    voxels = vtk_to_numpy(image.GetPointData().GetScalars()).reshape(20, 20, 20)
-    voxels[:] = 0
-    voxels[3:17, 9:11, 9:11] = 1
-    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "S")
-    p.vesselsSegmentId = node.AddSegmentFromBinaryLabelmapRepresentation(image, "vessels", [1.0, 0.0, 0.0])
-    p.vesselsNode, segmentation = node, node.GetSegmentation()
-
-    def width_mm() -> float:
-        return np.ptp(session.mesh(p, "vessels").vertices_mm[:, 0])
-
-    def smooth(factor: float, shown: bool) -> None:
-        segmentation.SetConversionParameter("Smoothing factor", str(factor))
-        if shown:
-            segmentation.CreateRepresentation("Closed surface", True)
-
-    usual = width_mm()
-    smooth(0.5, shown=True)
-    assert width_mm() == pytest.approx(usual, abs=1e-3)
-    smooth(0.0, shown=True)
-    sharp = width_mm()
-    assert sharp > usual + 0.1
-    segmentation.RemoveRepresentation("Closed surface")
-    assert width_mm() == pytest.approx(sharp, abs=1e-3)
-    smooth(0.5, shown=False)
-    assert width_mm() == pytest.approx(usual, abs=1e-3)
-    smooth(0.0, shown=False)
-    asked: list[dict] = []
-    surfaces = SegmentSurfaces(asked.append)
-    list(surfaces.asking(node, p.vesselsSegmentId, tmp_path))
-    surfaces.take(asked[0], {"answer": answering()(asked[0])})
-    made = surfaces.made(node, p.vesselsSegmentId)
-    assert np.ptp(made.vertices_mm[:, 0]) == pytest.approx(sharp, abs=1e-3)
-    smooth(0.5, shown=False)
-    assert surfaces.to_ask(node, p.vesselsSegmentId)
-
-
-def test_the_session_loads_nothing_heavy():
-    """In a fresh interpreter: what the panel imports when it is opened."""
-    import subprocess
-
-    code = (
-        "import sys; from ExpectedAppearancesLib.mrml import planning_session, planning_adopt, labelling, charts; "
-        "from ExpectedAppearancesLib.runs import runner, closing, dependencies; "
-        "from ExpectedAppearancesLib.model.presets import PRESETS; from ExpectedAppearancesLib.masks import stage; "
-        "session = planning_session.PlanningSession(); "
-        "print([m for m in ('torch', 'cv2', 'onnxruntime', 'skimage', 'scipy', 'matplotlib') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "[]", done.stdout + done.stderr
-
-
-LOOK_AROUND = """
-import sys
-sys.path.insert(0, sys.argv[1])
-import cases, numpy as np
-from ExpectedAppearancesLib.masks.renderer import MaskRenderer
-from ExpectedAppearancesLib.mrml import planning
-from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
-from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
-vessels, cortex, camera = cases.vessels(), cases.dome(), cases.camera()
-sampler = PoseSampler(find_craniotomy(vessels, cortex), PoseRanges(), camera, vessels.vertices_mm, 0)
-poses = np.stack([sampler.sample(i) for i in range(3)])
-planning.frustum_polydata(camera, poses, np.ones(3), "LPS")
-with MaskRenderer(vessels, cortex, camera) as renderer:
-    assert renderer.render(poses[0]).any()
-print([m for m in ("torch", "cv2", "onnxruntime", "skimage", "scipy") if m in sys.modules])
-"""
-
-
-def test_drawing_cameras_and_label_maps_loads_nothing_heavy():
-    """OpenCV takes a quarter of a second of the GUI's thread, seconds on a busy computer."""
-    import subprocess
-    from pathlib import Path
-
-    command = [sys.executable, "-c", LOOK_AROUND, str(Path(__file__).parent)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "[]", done.stdout + done.stderr

@@ -31,6 +31,7 @@ from ExpectedAppearancesLib.evaluation.verdict import Limits, figures_of_model, 
 
 MISSING, READY, RUNNING, STALE, DONE = StepState
 CRANIOTOMY = {"centre_world_mm": [1.0, 2.0, 3.0], "outward_axis": [0.0, 0.0, 1.0], "up": [0.0, 1.0, 0.0]}
+ROUNDED = CRANIOTOMY | {"outward_axis": [1e-10, 0.0, 1.0]}
 RANGES = {
     "tilt_max_deg": 50.0,
     "roll_max_deg": 45.0,
@@ -362,7 +363,9 @@ def test_a_study_of_other_poses_is_outdated(case):
         (RANGES, CRANIOTOMY, "known"),
         (STEEPER["ranges"], CRANIOTOMY, "stale"),
         (RANGES, MOVED, "stale"),
+        (RANGES, ROUNDED, "known"),  # drawn again, in more poses
         (RANGES, None, "known"),  # of an older version, which did not say
+        (STEEPER["ranges"], None, "stale"),
     ):
         inputs = {"ranges": ranges, "craniotomy": craniotomy}
         files.write_json(case.folder / "study" / "study.json", study() | {"inputs": inputs})

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ExpectedAppearancesLib.runs.environment import LIBRARY_PARENT, environment_of, python_for_runs, script_of
-from ExpectedAppearancesLib.runs.output import READ_AT_ONCE, OutputReader, figures_history
+from ExpectedAppearancesLib.runs.output import READ_AT_ONCE, OutputReader
 from ExpectedAppearancesLib.runs.state import RunState, controls
 
 # --- states ----------------------------------------------------------------------------------------------------------
@@ -82,16 +82,6 @@ def test_of_a_long_log_only_the_end_is_read(tmp_path):
     reader.read()
     assert time.thread_time() - begin < 0.1
     assert reader.figures == {"step": 5} and path.stat().st_size > 4 * READ_AT_ONCE
-
-
-def test_history_of_a_resumed_run_counts_each_step_once(tmp_path):
-    (tmp_path / "logs").mkdir()
-    for name, steps in (("1", range(0, 60, 10)), ("2", range(40, 80, 10))):
-        lines = [f'figures {{"step": {step}, "loss": {name}}}' for step in steps]
-        (tmp_path / "logs" / f"{name}-train.output.log").write_text("\n".join([*lines, "figures {", "x"]), "utf-8")
-    history = figures_history(tmp_path, "train")
-    assert [f["step"] for f in history] == [0, 10, 20, 30, 40, 50, 60, 70]
-    assert [f["loss"] for f in history] == [1, 1, 1, 1, 2, 2, 2, 2]
 
 
 # --- which Python, which script --------------------------------------------------------------------------------------

@@ -329,6 +329,15 @@ def test_a_run_of_a_case_is_not_taken_for_one_of_its_copy_and_follows_it_when_it
     assert found.wait(DEADLINE_S).state is RunState.CANCELLED
 
 
+def test_the_copy_of_a_case_whose_drive_is_gone_is_worked_on(case, vanish):
+    """Its record still names the folder on the drive."""
+    start(case, "done").wait(DEADLINE_S)
+    copy = case.with_name("copy")
+    shutil.copytree(case, copy)
+    vanish(case)
+    assert record.read_record(copy, "synthesize").outcome == "done"
+
+
 def test_a_later_process_learns_once_that_a_run_has_crashed(case):
     elsewhere(case, "start", "crash")
     state, _, code, problem = elsewhere(case, "wait")
@@ -404,27 +413,14 @@ def test_a_run_of_another_computer_is_not_judged_by_its_number_here(case):
 
 
 @pytest.mark.parametrize(
-    ("choice", "answer", "goes_on"),
-    [
-        (closing.OnClose.END, None, False),
-        (closing.OnClose.DETACH, None, True),
-        (closing.OnClose.ASK, closing.OnClose.END, False),
-        (closing.OnClose.ASK, closing.OnClose.DETACH, True),
-        (closing.OnClose.ASK, None, True),
-    ],
+    ("choice", "goes_on"),
+    [(closing.OnClose.END, False), (closing.OnClose.DETACH, True), (closing.OnClose.ASK, True)],
 )
-def test_closing_ends_or_leaves_runs_as_the_user_chose(case, choice, answer, goes_on):
+def test_closing_ends_or_leaves_runs_as_the_user_chose(case, choice, goes_on):
     run = start(case, "orderly")
     wait_until_ready(case)
-    asked = []
-
-    def ask(text):
-        asked.append(text)
-        return answer
-
-    left = closing.close_runs([None, run], choice, ask if answer else None)
+    left = closing.close_runs([None, run], choice)
     assert left[run].active == goes_on and run._tree.running() == goes_on
-    assert bool(asked) == (answer is not None) and all(str(case) in text for text in asked)
     assert (Run.find(case, "synthesize") is not None) == goes_on
 
 
@@ -440,7 +436,7 @@ def test_what_goes_on_is_asked_about_in_the_users_words_and_time(monkeypatch):
         time.tzset()
 
 
-def test_closing_asks_nothing_when_nothing_goes_on(case):
+def test_what_has_ended_is_not_closed(case):
     run = start(case, "done")
     run.wait(DEADLINE_S)
-    assert closing.close_runs([run, None], closing.OnClose.ASK, lambda _text: pytest.fail("asked")) == {}
+    assert closing.close_runs([run, None], closing.OnClose.END) == {}

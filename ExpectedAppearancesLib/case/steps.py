@@ -159,6 +159,16 @@ def craniotomy_moved(first: dict, second: dict | None) -> bool:
     )
 
 
+def drawn_from_elsewhere(poses: dict, render: dict | None) -> bool:
+    """Whether the poses of a training or study, as far as it says which they were, are not those that `render` has
+    recorded since."""
+    if not render or not all(render.get(key) for key in POSES_DEPEND_ON):
+        return False
+    known = {key: poses.get(key) or render[key] for key in POSES_DEPEND_ON}
+    of_both = {"poses": None, "seed": None}  # label maps are drawn of their own ones
+    return bool(changes_of_poses(known | of_both, render | of_both))
+
+
 def changes_of_textures(chosen: dict[str, str], index: dict) -> list[str]:
     """Which textures were added, removed or changed since the appearances of `index` were made."""
     made = {item["style"]: item.get("texture_sha256") for item in index["items"]}
@@ -296,7 +306,7 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
         changed.append("the expected appearances")
     render = stages.get("render")
     other_view = recorded.model and recorded.model.get("plausible_view") and _view_changed(recorded.model, render)
-    if other_view or _drawn_from_elsewhere(train, render):
+    if other_view or drawn_from_elsewhere(train.get("poses") or {}, render):
         changed.append("the poses")
     trained = train.get("preset", {}).get("name", "")
     if chosen.preset and trained and chosen.preset != trained:
@@ -355,15 +365,6 @@ def _view_changed(model: dict, render: dict | None) -> bool:
         and _close(view["tilt_max_deg"], ranges["tilt_max_deg"], ANGLE_TOLERANCE_DEG)
         and _close(view["distance_mm"], ranges["working_distance_mm"], LENGTH_TOLERANCE_MM)
     )
-
-
-def _drawn_from_elsewhere(train: dict, render: dict | None) -> bool:
-    """Whether the poses of training, where it says which they were, are not those that `render` has recorded since."""
-    poses = train.get("poses") or {}
-    if not render or not all(poses.get(key) for key in POSES_DEPEND_ON):
-        return False
-    of_both = {"poses": None, "seed": None}  # label maps are drawn of their own ones
-    return bool(changes_of_poses(poses | of_both, render | of_both))
 
 
 def _close(first, second, tolerance: float) -> bool:

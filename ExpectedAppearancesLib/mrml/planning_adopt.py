@@ -41,7 +41,7 @@ def adopting(
     if case is None:
         with _at_once(parameters):
             parameters.casePath = folder
-            parameters.vesselsNode = parameters.cortexModel = None
+            parameters.vesselsNode = parameters.cortexModel = parameters.mriVolume = None
         return None
     added: list = []
     left = (parameters.vesselsNode, parameters.cortexModel) if parameters.casePath not in ("", folder) else ()

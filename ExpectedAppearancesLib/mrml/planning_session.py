@@ -408,4 +408,4 @@ class _Same:
 
 
 def _number(value) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.10f}".rstrip("0").rstrip(".")
+    return str(value) if isinstance(value, int) else np.format_float_positional(value, trim="-")

@@ -43,7 +43,8 @@ def find_craniotomy(
     length = np.linalg.norm(axis)
     if not np.isfinite(length) or length < 1e-9:
         raise InputError("craniotomy: the outward axis cannot be found; give a point and an outward normal.")
-    axis = axis / length
+    if normal is None or abs(length - 1) > 1e-9:  # one that was recorded stays the very same
+        axis = axis / length
     return Craniotomy(centre, axis, upright(axis, space))
 
 

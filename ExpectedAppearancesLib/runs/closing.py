@@ -6,7 +6,7 @@ Leaving the module ends nothing. Closing a scene or Slicer does what the user ha
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from enum import Enum
 
 from .runner import CANCEL_DEADLINE_S, SWEEP_DEADLINE_S, Run
@@ -45,19 +45,13 @@ def _clock(run: Run) -> str:
     return f"{datetime.datetime.fromisoformat(run.started).astimezone():%Y-%m-%d %H:%M}"
 
 
-def close_runs(
-    runs: Iterable[Run | None], choice: OnClose, ask: Callable[[str], OnClose] | None = None
-) -> dict[Run, RunState]:
+def close_runs(runs: Iterable[Run | None], choice: OnClose) -> dict[Run, RunState]:
     """End or detach what is going on; returns the state that each such run was left in.
 
-    ask: called with the question when the choice is ASK, answers END or DETACH. Where nobody can be asked the runs go
-    on: nothing is lost then. Ending waits until the processes are gone, half a minute at most.
+    With ASK, where nobody can be asked, the runs go on: nothing is lost then. Ending waits until the processes are
+    gone, half a minute at most.
     """
     active = going_on(runs)
-    if not active:
-        return {}
-    if choice is OnClose.ASK:
-        choice = ask(question(active)) if ask else OnClose.DETACH
     # A run that is being cancelled already is not let go before its processes are gone.
     ending = [run for run in active if choice is OnClose.END or run.poll().state is RunState.CANCELLING]
     for run in ending:

@@ -220,10 +220,3 @@ def _pip_log(folder: Path) -> Iterator[Path]:
             del os.environ["PIP_LOG"]
         else:
             os.environ["PIP_LOG"] = usual
-
-
-def system_report() -> str:
-    """See `system_report.system_report`; takes seconds, `system_report.SystemCheck` does not."""
-    from .system_report import system_report
-
-    return system_report()

@@ -89,25 +89,3 @@ class OutputReader:
                     words.append(more)
                 return "\n".join(words)
         return ""
-
-
-def figures_history(case_folder: Path, kind: str) -> list[dict]:
-    """All figures that the runs of this kind have told in this case, oldest first, one dict per report, for a plot.
-
-    Where a resumed run repeats steps (key "step"), the later report counts. Reads every log: not for each tick.
-    """
-    history: list[dict] = []
-    for path in sorted((Path(case_folder) / "logs").glob(f"*-{kind}.output.log")):
-        first = True
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            if not line.startswith(FIGURES_PREFIX):
-                continue
-            try:
-                figures = json.loads(line[len(FIGURES_PREFIX) :])
-            except ValueError:
-                continue
-            if "step" in figures and first:
-                history = [f for f in history if f.get("step", -1) < figures["step"]]
-                first = False
-            history.append(figures)
-    return history

@@ -74,7 +74,7 @@ def read_record(case_folder: Path, kind: str) -> RunRecord | None:
 
 def _is_of_another_case(record: RunRecord, case_folder: Path) -> bool:
     """Whether the run works on another folder, of which this one is a copy; not where that was moved to here."""
-    worked_on = [Path(word) for word in record.command if (Path(word) / "case.json").is_file()]
+    worked_on = [word for word in record.command if os.path.isfile(Path(word) / "case.json")]
     return bool(worked_on) and not any(os.path.samefile(folder, case_folder) for folder in worked_on)
 
 
@@ -141,9 +141,13 @@ def refuse_if_occupied(folder: Path, kinds: Iterable[str] = tuple(NAMES)) -> Non
     if importlib.util.find_spec("filelock") is None:
         return
     for kind in kinds:
-        if os.path.exists(_lock_path(folder, kind)):  # in a case that cannot be written there is none to be made
-            with exclusive(folder, kind):
-                pass
+        path = _lock_path(folder, kind)
+        if os.path.exists(path):  # in a case that cannot be written there is none to be made
+            with files.writing(path):
+                lock = _locked(path, 0.0)
+            if lock is None:
+                raise InputError(_occupied(folder, kind, _holder(path)))
+            lock.release()
 
 
 def _lock_path(folder: Path, name: str) -> Path:

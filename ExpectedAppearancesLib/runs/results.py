@@ -38,15 +38,6 @@ def result_problem(kind: str, case_folder: Path, thorough: bool = False) -> str:
     return ""
 
 
-def is_unfinished(kind: str, case_folder: Path) -> bool:
-    """Whether the case holds the beginning of a result, so that starting means going on."""
-    try:
-        stages = files.read_json(Path(case_folder) / "case.json", "case manifest")["stages"]
-        return stages.get(STAGES.get(kind, kind), {}).get("done") is False
-    except (InputError, KeyError, TypeError, AttributeError):
-        return False
-
-
 def remove_partial_files(case_folder: Path, pids: Iterable[int]) -> None:
     """Remove what `files.replacing` leaves behind when its process is killed; those processes must have ended."""
     for pid in pids:

@@ -41,12 +41,12 @@ class SystemCheck:
         return self._report
 
 
-def system_report(report: dict | None = None) -> str:
+def system_report(report: dict) -> str:
     """Everything that the command `check` prints, what each purpose still needs, and 3D Slicer's version.
 
-    report: what SystemCheck.poll() has found; without it the check is made here, which takes seconds.
+    report: what SystemCheck.poll() has found.
     """
-    lines = check.report_lines(report or check.make_report())
+    lines = check.report_lines(report)
     for kind, purpose in PURPOSES.items():
         lacking = dependencies.missing(kind)
         lines.append(f"For {purpose}: {'lacks ' + ', '.join(lacking) if lacking else 'all packages are there'}")

@@ -211,6 +211,7 @@ class CaseSection(Section):
         return self._saving is not None or self._keeping.working
 
     def _put_in_place(self, made: Path, folder: Path) -> None:
+        problems = []
         try:
             if made != folder:
                 refuse_if_occupied(folder)  # what goes on there would write into the new case
@@ -223,19 +224,14 @@ class CaseSection(Section):
                 except OSError:
                     kept.rename(folder)
                     raise
-        except OSError as error:
-            shutil.rmtree(made, ignore_errors=True)
-            self._tell(
-                [
-                    _("{folder}: could not be replaced ({error}); close what uses it, and save again.").format(
-                        folder=folder, error=error
-                    )
-                ]
-            )
-            return
         except InputError as error:
+            problems = error.problems
+        except OSError as error:
+            text = _("{folder}: could not be replaced ({error}); close what uses it, and save again.")
+            problems = [text.format(folder=folder, error=error)]
+        if problems:
             shutil.rmtree(made, ignore_errors=True)
-            self._tell(error.problems)
+            self._tell(problems)
             return
         if Path(self.parameters.casePath) == folder:  # else another case was opened meanwhile
             self.panel.open_folder(str(folder))

@@ -64,7 +64,7 @@ class PlanningPanel:
         self._surfaces = Asking("surfaces", self._on_surface, urgent=True)
         session.surfaces = SegmentSurfaces(self._surfaces.ask)
         self._left: list = []  # runs of cases that were open before this one
-        self._ending: list = []  # runs of a closed scene that are being ended
+        self._ending: list = []  # runs of cases that are no longer open, on their way to their end
         self._ending_timer = qt.QTimer()
         self._ending_timer.setInterval(500)
         self._ending_timer.connect("timeout()", self._poll_ending)
@@ -131,8 +131,7 @@ class PlanningPanel:
             self._followed = self.parameters.casePath
             self.sections["training"].forget_run()
             left = [run for run in self._going_on() if run.case_folder != Path(self._followed)]
-            self._end([run for run in left if run.poll().state is RunState.CANCELLING])
-            self._left = [run for run in left if run not in self._ending]
+            self._left = self._not_cancelled(left)
             for watch in self.runs.values():
                 watch.follow(self._followed)
         if not self.entered:
@@ -264,7 +263,7 @@ class PlanningPanel:
 
     def closing_scene(self) -> None:
         """Before the scene is closed: runs end or go on as the user chose, and every node is let go."""
-        active, self._left = self._going_on(), []
+        active, self._left = self._not_cancelled(self._going_on()), []
         if active and self._choice(active) is OnClose.END:
             self._end(active)
         for watch in self.runs.values():
@@ -287,6 +286,12 @@ class PlanningPanel:
             return choice
         goes_on = slicer.util.confirmYesNoDisplay(question(active), windowTitle=_("Let it go on?"))
         return OnClose.DETACH if goes_on else OnClose.END
+
+    def _not_cancelled(self, runs: list) -> list:
+        """Those that can go on by themselves; it is seen to that the others end."""
+        cancelled = [run for run in runs if run.poll().state is RunState.CANCELLING]
+        self._end(cancelled)
+        return [run for run in runs if run not in cancelled]
 
     def _end(self, runs: list) -> None:
         for run in runs:

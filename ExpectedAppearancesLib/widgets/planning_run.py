@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -56,8 +54,7 @@ class RunWatch:
 
     def start(self, case_folder: str, arguments: list[str], environment: dict[str, str] | None = None) -> None:
         """Raises ExpectedAppearancesError when it cannot be started. environment: added for the run alone."""
-        with _environment(environment or {}):
-            self.run = Run.start(self.kind, case_folder, arguments)
+        self.run = Run.start(self.kind, case_folder, arguments, environment=environment)
         logging.info("Expected Appearances: %s started, log %s", self.kind, self.run.log_path)
         self._watch()
 
@@ -144,18 +141,3 @@ def started(panel, watch: RunWatch, arguments: list[str], environment: dict[str,
         return False
     panel.refresh_soon()
     return True
-
-
-@contextlib.contextmanager
-def _environment(values: dict[str, str]):
-    """Within the block the process has these variables, which the child then inherits."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
