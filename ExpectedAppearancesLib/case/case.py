@@ -193,11 +193,8 @@ def _check_new_folder(folder: Path, problems: Problems) -> None:
         return
     if folder.is_dir() and any(folder.iterdir()):
         problems.add(f"{folder}: exists and is not empty; give a new folder, or remove this one first.")
-    parent = files.existing_parent(folder)
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        problems.add(f"{parent}: no folder can be made here; choose a folder you may write to.")
-        return
     with problems.collect():
+        files.require_writable(folder.parent)
         files.require_space(folder, NEEDED_MB)
 
 
