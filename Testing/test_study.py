@@ -369,6 +369,8 @@ def test_frames_that_cannot_be_registered_are_told_before_anything_is_trained(st
         run(studied)
     assert [name in text for name, text in zip(("2.png", "7.png"), caught.value.problems)] == [True, True]
     assert not calls(studied)
+    pairs, of_another = [(studied.case, studied.poses)], replace(QUICK, styles=("a",))
+    assert study._check(pairs, studied.out, of_another, lambda *_: None)  # it registers neither
 
 
 def test_a_model_that_cannot_be_tested_for_robustness_is_told_before_anything_is_trained(studied, monkeypatch):

@@ -195,8 +195,10 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
         )
     if settings.textures_study and len(styles) < LEFT_OUT:
         problems.add(f"{poses_path}: has frames of {len(styles)} textures; --textures-study tests on {LEFT_OUT}.")
+    chosen = [style for style in styles if settings.styles is None or style in settings.styles]
+    registered = styles if settings.textures_study else chosen
     for frame in frames:  # one that cannot be read would end the study after all its trainings
-        if frame.style in styles:
+        if frame.style in registered:
             with problems.collect():
                 check_frame(frame, camera)
     if settings.robustness and (case.model_folder / "model.onnx").is_file():
@@ -216,7 +218,6 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
         "ranges": render.get("ranges"),
         "craniotomy": render.get("craniotomy"),
     }
-    chosen = [style for style in styles if settings.styles is None or style in settings.styles]
     return StudyCase(case, poses_path, camera, frames, textures, styles, chosen, method, inputs)
 
 
