@@ -187,6 +187,13 @@ class Case:
         files.write_json(path, self.manifest)
 
 
+def pose_settings(manifest: dict) -> dict:
+    """'ranges' and 'craniotomy' as `render` recorded them last, None where it has not: training, too, draws poses in
+    these ranges around the craniotomy."""
+    render = manifest["stages"].get("render", {})
+    return {key: render.get(key) for key in ("ranges", "craniotomy")}
+
+
 def _check_new_folder(folder: Path, problems: Problems) -> None:
     if folder.is_file():
         problems.add(f"{folder}: is a file; give the name of a new folder.")

@@ -15,8 +15,8 @@ from .. import files
 from ..appearances.store import METHODS, newest_image
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
-from .case import MANIFEST_NAME, Case
-from .steps import POSES_DEPEND_ON, Recorded, Study
+from .case import MANIFEST_NAME, Case, pose_settings
+from .steps import Recorded, Study
 
 STOPPED = ("cancelled", "failed")  # outcomes of a run as its record names them
 LARGEST_HEADER_BYTES = 1 << 24
@@ -82,12 +82,12 @@ class CaseReader:
                 rows = figures_of_study(study)
             except InputError:
                 rows = []
-            inputs, render = study.get("inputs") or {}, case.manifest["stages"].get("render", {})
+            inputs, now = study.get("inputs") or {}, pose_settings(case.manifest)
             used = inputs.get("appearances_sha256")
             indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
             stale = bool(used) and used not in [index[1] for index in indices if index]
             # Of another craniotomy, or of a narrower range, they say nothing of the model that was trained since.
-            stale = stale or any(inputs.get(k) not in (None, render.get(k)) for k in POSES_DEPEND_ON)
+            stale = stale or any(inputs.get(key) not in (None, now[key]) for key in now)
             presets = {content["preset"] for content in (study, model or {}) if content.get("preset")}
             stale = bool(rows) and (stale or len(presets) > 1)
         if model:

@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import files
 from ..appearances.store import folder_of, read_appearances
-from ..case.case import Case
+from ..case.case import Case, pose_settings
 from ..errors import InputError, Problems
 from ..executor import LOCAL, check_executor, run_jobs
 from ..geometry.camera import Camera
@@ -209,15 +209,11 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
     elif settings.robustness and not settings.protocols:
         problems.add(f"{folder}: has no model to test for robustness; run `train`, or study the protocol strict too.")
     problems.raise_if_any()
-    render = case.manifest["stages"].get("render", {})
     inputs = {
         "vessels_sha256": case.vessels_sha256,
         "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
         "poses_sha256": files.sha256(poses_path),
-        # Training draws its poses in these ranges, around the craniotomy.
-        "ranges": render.get("ranges"),
-        "craniotomy": render.get("craniotomy"),
-    }
+    } | pose_settings(case.manifest)
     return StudyCase(case, poses_path, camera, frames, textures, styles, chosen, method, inputs)
 
 
