@@ -320,13 +320,6 @@ def test_number_of_textures_trains_on_exactly_that_many(tmp_path, studied, monke
     assert "Number of textures" in (studied.out / "report.html").read_text(encoding="utf-8")
 
 
-def test_nearest_other_pose_against_plain_distances():
-    poses = [pose_from_rotation(np.eye(3), (x, 0, 100)) for x in (0.0, 3.0, 10.0)]
-    points = np.random.default_rng(0).normal(size=(40, 3))
-    assert sorted(study.nearest_other_pose_add_mm(points, [*poses, poses[0]])) == pytest.approx([3, 3, 7])
-    assert len(study.nearest_other_pose_add_mm(points, poses[:1])) == 0
-
-
 def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
     """The paper's preset makes every pose with every texture: frames drawn of one are at poses of the others."""
     case = Case.open(studied.case)

@@ -24,7 +24,7 @@ from ..registration.poses_file import Frame, read_poses, write_poses
 from ..registration.predictor import FORMAT_VERSION as MODEL_VERSION
 from .curves import curve_points
 from .evaluate import Evaluation, check_frame, check_out, compare, known_frames, overlay_images, register_frames
-from .metrics import add_auc, add_mm
+from .metrics import add_auc, nearest_other_pose_add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
 from .study_frames import FRAMES_PER_TEXTURE, check_unseen_poses, drawn_frames
@@ -397,15 +397,3 @@ def _write_overlays(one: StudyCase, evaluation: Evaluation, name: str) -> str:
     chosen = choose_frames(evaluation.errors.add_mm, evaluation.styles, 12)
     files.write_png(one.folder / f"overlays-{name}.png", sheet(overlay_images(one.case, evaluation, chosen)))
     return f"overlays-{name}.png"
-
-
-def nearest_other_pose_add_mm(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
-    """ADD (P,) of answering, for each distinct pose, the nearest other one, chosen knowing the truth: what memory of
-    poses alone could reach. Empty for fewer than two distinct poses."""
-    distinct = np.unique(np.round(np.asarray(poses, float).reshape(-1, 16), 6), axis=0).reshape(-1, 4, 4)
-    some = vertices_mm[:: max(1, len(vertices_mm) // 300)]
-    nearest = []
-    for i, pose in enumerate(distinct if len(distinct) > 1 else ()):
-        others = np.delete(distinct, i, axis=0)
-        nearest.append(add_mm(some, np.broadcast_to(pose, others.shape), others).min())
-    return np.array(nearest)
