@@ -152,6 +152,13 @@ def existing_parent(path: Path) -> Path:
     return next((folder for folder in path.parents if folder.exists()), Path(path.anchor))
 
 
+def require_writable(folder: Path) -> None:
+    """Raise InputError where nothing can be made in `folder`, or in the nearest one above it that is there."""
+    existing = existing_parent(Path(folder).absolute() / "file")
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise InputError(f"{existing}: nothing can be written here; choose a folder you may write to.")
+
+
 def require_space(folder: Path, needed_mb: float) -> None:
     """Raise InputError when the disk of `folder` (or its nearest existing parent) has less than `needed_mb` free."""
     folder = existing_parent(Path(folder).absolute() / "file")

@@ -1,8 +1,9 @@
-"""Small meshes and cases for tests: a domed patch with an asymmetric Y of vessels on it."""
+"""Small meshes and cases for tests: a domed patch with an asymmetric Y of vessels on it; and how to wait."""
 
 from __future__ import annotations
 
 import itertools
+import time
 
 import numpy as np
 
@@ -78,3 +79,10 @@ def texture(name: str = "a", vessel_colour=(40, 30, 160), size: int = 48) -> Tex
     labels[size // 2 :, size // 3 : size // 2] = 2
     image = np.where((labels == 2)[..., None], vessel_colour, (210, 130, 110)) + rng.normal(0, 15, (size, size, 3))
     return Texture(name, np.clip(image, 0, 255).astype(np.uint8), labels)
+
+
+def wait_until(condition, timeout_s: float = 120.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)

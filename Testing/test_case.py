@@ -158,7 +158,7 @@ class _Usage:
 def test_a_folder_that_cannot_be_written(tmp_path, inputs, monkeypatch):
     """Simulated: whoever runs tests as root may write everywhere."""
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
-    with pytest.raises(InputError, match="no folder can be made here"):
+    with pytest.raises(InputError, match="nothing can be written here"):
         create(tmp_path / "case", inputs)
 
 
@@ -173,7 +173,7 @@ def test_a_drive_that_is_not_there_is_refused(tmp_path, inputs, monkeypatch):
         return False
 
     monkeypatch.setattr(Path, "exists", is_missing)
-    with pytest.raises(InputError, match="no folder can be made here"):
+    with pytest.raises(InputError, match="nothing can be written here"):
         create(tmp_path / "case", inputs)
 
 

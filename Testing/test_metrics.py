@@ -171,3 +171,9 @@ def test_reliability_of_confidences_that_mean_what_they_say_and_of_boasts():
     (row,) = boasts["bins"]
     assert row["from"] == 0.9 and row["add_below_3mm"] == pytest.approx(good.mean())
     assert boasts["expected_calibration_error"] == pytest.approx(1 - good.mean())
+
+
+def test_nearest_other_pose_against_plain_distances():
+    poses = [pose(translation=(x, 0, 100)) for x in (0.0, 3.0, 10.0)]
+    assert sorted(metrics.nearest_other_pose_add_mm(CUBE, [*poses, poses[0]])) == pytest.approx([3, 3, 7])
+    assert len(metrics.nearest_other_pose_add_mm(CUBE, poses[:1])) == 0

@@ -304,6 +304,14 @@ def test_verdict_on_the_models_own_validation():
     assert verdict(rows, Limits()) == (False, ("20 % of views accepted, at least 30 % wanted",))
     assert verdict(figures_of_model({"validation": values | {"accepted_of_true": 0.4}}), Limits()) == (True, ())
     assert verdict([], Limits()) is None
+    nothing_shown = {"accepted_of_true": 0.0, "accepted_add_mm_mean": None, "accepted_add_below_3mm": None}
+    for limits in (Limits(), Limits(accepted_min=0.0)):  # and not two unknown figures beside it
+        assert verdict(figures_of_model({"validation": values | nothing_shown}), limits) == (
+            False,
+            ("no view is accepted",),
+        )
+    del values["accepted_add_mm_mean"]  # as of a model of an older version
+    assert "train again" in verdict(figures_of_model({"validation": values}), Limits())[1][0]
     unknown = figures_of_model({"validation": {"add_mm_mean": None, "steps": 3}})
     assert len(verdict(unknown, Limits())[1]) == 3  # what was not measured is not met
 

@@ -224,7 +224,7 @@ def test_the_end_of_a_run_is_seen_although_its_drive_is_gone(case, vanish):
 
 def test_a_second_run_of_the_kind_is_refused_while_one_goes_on(case):
     run = start(case, "wait")
-    with pytest.raises(InputError, match=rf"going on .*{run._record.pid}"):
+    with pytest.raises(InputError, match=rf"going on .*{run._record.pid}, since 20..-..-.. ..:..\)"):
         start(case, "wait")
     other = Run.start("train", case, ["wait"])
     assert other.poll().state.active
@@ -425,12 +425,14 @@ def test_closing_ends_or_leaves_runs_as_the_user_chose(case, choice, goes_on):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="its time zone is not that of the environment")
-def test_what_goes_on_is_asked_about_in_the_users_words_and_time(monkeypatch):
+def test_what_goes_on_is_asked_about_in_the_users_words_and_time(monkeypatch, tmp_path):
     monkeypatch.setenv("TZ", "America/New_York")
     time.tzset()
     try:
         run = SimpleNamespace(kind="synthesize", case_folder="/cases/a", started="2026-01-02T03:04:05+00:00")
         assert "- Expected appearances are being made in /cases/a, since 2026-01-01 22:04\n" in closing.question([run])
+        holder = {"pid": 7, "host": "elsewhere", "since": run.started, "work": ""}
+        assert "(process 7 on elsewhere, since 2026-01-01 22:04)" in record._occupied(tmp_path, "train", holder)
     finally:
         monkeypatch.undo()
         time.tzset()

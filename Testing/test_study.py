@@ -1,4 +1,4 @@
-"""The study: figures against hand computation, folds that are not trained twice, kills, cancelling, executors."""
+"""The study: figures against hand computation, folds that are not trained twice, kills, cancelling."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cases import camera, write_inputs
+from cases import camera, wait_until, write_inputs
 
-from ExpectedAppearancesLib import executor, files
+from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
@@ -252,13 +251,6 @@ def test_a_study_that_is_killed_goes_on(studied, tmp_path):
     assert result["protocols"]["strict"]["all"]["frames"] == 9
 
 
-def wait_until(condition, timeout_s: float = 120.0) -> None:
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def alive(process_id: int) -> bool:
     try:
         os.kill(process_id, 0)
@@ -320,13 +312,6 @@ def test_number_of_textures_trains_on_exactly_that_many(tmp_path, studied, monke
     assert "Number of textures" in (studied.out / "report.html").read_text(encoding="utf-8")
 
 
-def test_nearest_other_pose_against_plain_distances():
-    poses = [pose_from_rotation(np.eye(3), (x, 0, 100)) for x in (0.0, 3.0, 10.0)]
-    points = np.random.default_rng(0).normal(size=(40, 3))
-    assert sorted(study.nearest_other_pose_add_mm(points, [*poses, poses[0]])) == pytest.approx([3, 3, 7])
-    assert len(study.nearest_other_pose_add_mm(points, poses[:1])) == 0
-
-
 def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
     """The paper's preset makes every pose with every texture: frames drawn of one are at poses of the others."""
     case = Case.open(studied.case)
@@ -369,6 +354,8 @@ def test_frames_that_cannot_be_registered_are_told_before_anything_is_trained(st
         run(studied)
     assert [name in text for name, text in zip(("2.png", "7.png"), caught.value.problems)] == [True, True]
     assert not calls(studied)
+    pairs, of_another = [(studied.case, studied.poses)], replace(QUICK, styles=("a",))
+    assert study._check(pairs, studied.out, of_another, lambda *_: None)  # it registers neither
 
 
 def test_a_model_that_cannot_be_tested_for_robustness_is_told_before_anything_is_trained(studied, monkeypatch):
@@ -385,61 +372,3 @@ def test_a_study_of_another_format_is_not_read(studied):
     files.write_json(study.study_path(studied.case), {"format": "else"})
     with pytest.raises(InputError, match="run `study` again"):
         study.read_study(studied.case)
-
-
-def note_work(job, progress, stopped):
-    """A job for a cluster: leaves a file; 'bad' fails, 'long' waits to be stopped."""
-    folder, name = Path(job[0]), job[1]
-    if name == "bad":
-        wait_until(lambda: (folder / "long").exists(), 60)
-        raise InputError("bad: a job that fails")
-    (folder / name).write_text("")
-    if name == "long":
-        wait_until(stopped, 60)
-        (folder / "stopped").write_text("")
-        raise CancelledError("stopped")
-
-
-@pytest.fixture(scope="module")
-def cluster():
-    distributed = pytest.importorskip("dask.distributed", reason="dask.distributed is not installed")
-    options = {"processes": False, "protocol": "tcp", "dashboard_address": None, "host": "127.0.0.1"}
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **options) as cluster:
-        yield "dask://" + cluster.scheduler_address.removeprefix("tcp://")
-
-
-def test_jobs_run_on_a_cluster(cluster, tmp_path):
-    executor.check_executor(cluster)
-    heard = []
-    executor.run_jobs([(str(tmp_path), n) for n in "xyz"], note_work, cluster, lambda f, _text: heard.append(f))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["x", "y", "z"]
-    assert [fraction for fraction in heard if fraction] == pytest.approx([1 / 3, 2 / 3, 1])
-
-
-def test_a_study_whose_cluster_has_no_worker_says_so(tmp_path, monkeypatch):
-    """It waits for one as long as it takes, as after the last one was killed."""
-    distributed = pytest.importorskip("dask.distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr(executor, "ASK_EVERY_S", 0.1)
-    monkeypatch.setattr(executor, "STOP_S", 0.1)
-
-    def told(_fraction, message):
-        if "no worker" in message:
-            raise CancelledError(message)
-
-    nobody = distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=":0")
-    with nobody, pytest.raises(CancelledError, match="start `dask worker`"):
-        address = "dask://" + nobody.scheduler_address.removeprefix("tcp://")
-        executor.run_jobs([(str(tmp_path), "x")], note_work, address, told)
-
-
-def test_a_failing_job_of_a_cluster_stops_the_others(cluster, tmp_path):
-    with pytest.raises(InputError, match="bad: a job that fails"):
-        executor.run_jobs([(str(tmp_path), n) for n in ("long", "bad")], note_work, cluster, lambda *_: None)
-    assert (tmp_path / "stopped").exists()
-
-
-def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
-    pytest.importorskip("dask.distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr(executor, "CONNECT_S", 0.5)
-    with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        executor.connect("dask://127.0.0.1:9")

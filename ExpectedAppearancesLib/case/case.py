@@ -187,17 +187,21 @@ class Case:
         files.write_json(path, self.manifest)
 
 
+def pose_settings(manifest: dict) -> dict:
+    """'ranges' and 'craniotomy' as `render` recorded them last, None where it has not: training, too, draws poses in
+    these ranges around the craniotomy."""
+    render = manifest["stages"].get("render", {})
+    return {key: render.get(key) for key in ("ranges", "craniotomy")}
+
+
 def _check_new_folder(folder: Path, problems: Problems) -> None:
     if folder.is_file():
         problems.add(f"{folder}: is a file; give the name of a new folder.")
         return
     if folder.is_dir() and any(folder.iterdir()):
         problems.add(f"{folder}: exists and is not empty; give a new folder, or remove this one first.")
-    parent = files.existing_parent(folder)
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        problems.add(f"{parent}: no folder can be made here; choose a folder you may write to.")
-        return
     with problems.collect():
+        files.require_writable(folder.parent)
         files.require_space(folder, NEEDED_MB)
 
 

@@ -82,12 +82,12 @@ class CaseReader:
                 rows = figures_of_study(study)
             except InputError:
                 rows = []
-            inputs, render = study.get("inputs") or {}, case.manifest["stages"].get("render")
+            inputs = study.get("inputs") or {}
             used = inputs.get("appearances_sha256")
             indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
             stale = bool(used) and used not in [index[1] for index in indices if index]
             # Of another craniotomy, or of a narrower range, they say nothing of the model that was trained since.
-            stale = stale or drawn_from_elsewhere(inputs, render)
+            stale = stale or drawn_from_elsewhere(inputs, case.manifest)
             presets = {content["preset"] for content in (study, model or {}) if content.get("preset")}
             stale = bool(rows) and (stale or len(presets) > 1)
         if model:

@@ -11,12 +11,12 @@ from enum import Enum
 import numpy as np
 
 from ..geometry.camera import Camera
+from .case import pose_settings
 
 STEPS = ("case", "microscope", "poses", "textures", "appearances", "training", "validation")
 FEW_TEXTURES = 6  # fewer teach the network these textures rather than cortex
 LENGTH_TOLERANCE_MM = 0.05  # what is typed into a field is rounded to this
 ANGLE_TOLERANCE_DEG = 0.05
-POSES_DEPEND_ON = ("ranges", "craniotomy")  # of what `render` records: the poses that training draws
 RANGE_NAMES = {
     "tilt_max_deg": "the tilt",
     "roll_max_deg": "the roll",
@@ -139,6 +139,12 @@ def changes_of_poses(chosen: dict, recorded: dict) -> list[str]:
         changed.append("the number of poses")
     if chosen["seed"] != recorded.get("seed"):
         changed.append("the seed")
+    return changed + _changes_of_views(chosen, recorded)
+
+
+def _changes_of_views(chosen: dict, recorded: dict) -> list[str]:
+    """What differs of where the poses lie, however many there are."""
+    changed = []
     for key, name in RANGE_NAMES.items():
         tolerance = 0.005 if key == "in_view_min" else LENGTH_TOLERANCE_MM
         if not _close(chosen["ranges"].get(key), recorded.get("ranges", {}).get(key), tolerance):
@@ -159,14 +165,12 @@ def craniotomy_moved(first: dict, second: dict | None) -> bool:
     )
 
 
-def drawn_from_elsewhere(poses: dict, render: dict | None) -> bool:
+def drawn_from_elsewhere(poses: dict, manifest: dict) -> bool:
     """Whether the poses of a training or study, as far as it says which they were, are not those that `render` has
     recorded since."""
-    if not render or not all(render.get(key) for key in POSES_DEPEND_ON):
-        return False
-    known = {key: poses.get(key) or render[key] for key in POSES_DEPEND_ON}
-    of_both = {"poses": None, "seed": None}  # label maps are drawn of their own ones
-    return bool(changes_of_poses(known | of_both, render | of_both))
+    now = pose_settings(manifest)
+    known = {key: poses.get(key) or now[key] for key in now}
+    return all(now.values()) and bool(_changes_of_views(known, now))
 
 
 def changes_of_textures(chosen: dict[str, str], index: dict) -> list[str]:
@@ -295,7 +299,7 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
             changed = changes_of_training(chosen.preset, chosen.minutes, train.get("preset", {}))
             if train.get("appearances_sha256") not in (None, recorded.appearances_sha256):
                 changed.append("the expected appearances")
-            if train.get("poses") not in (None, {key: stages.get("render", {}).get(key) for key in POSES_DEPEND_ON}):
+            if train.get("poses") not in (None, pose_settings(recorded.manifest)):
                 changed.append("the poses")
             if changed:
                 return Step(StepState.READY, f"{stopped}. Changed since: {_listed(changed)}; so it begins anew.")
@@ -306,7 +310,7 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
         changed.append("the expected appearances")
     render = stages.get("render")
     other_view = recorded.model and recorded.model.get("plausible_view") and _view_changed(recorded.model, render)
-    if other_view or drawn_from_elsewhere(train.get("poses") or {}, render):
+    if other_view or drawn_from_elsewhere(train.get("poses") or {}, recorded.manifest):
         changed.append("the poses")
     trained = train.get("preset", {}).get("name", "")
     if chosen.preset and trained and chosen.preset != trained:

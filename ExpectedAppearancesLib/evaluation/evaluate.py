@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,8 +103,7 @@ def check_out(folder: Path) -> None:
     existing = files.existing_parent(folder.absolute() / "file")
     if existing.is_file():
         raise InputError(f"{existing}: is a file; give --out the name of a folder.")
-    if not os.access(existing, os.W_OK):
-        raise InputError(f"{existing}: nothing can be written here; choose a folder you may write to.")
+    files.require_writable(folder)
     files.require_space(folder, NEEDED_MB)
 
 

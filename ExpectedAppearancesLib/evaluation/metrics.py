@@ -173,6 +173,18 @@ def mean_pose(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarra
     return pose_from_rotation(rotation, position - rotation @ centroid)
 
 
+def nearest_other_pose_add_mm(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
+    """ADD (P,) of answering, for each distinct pose, the nearest other one, chosen knowing the truth: what memory of
+    poses alone could reach. Empty for fewer than two distinct poses."""
+    distinct = np.unique(np.round(np.asarray(poses, float).reshape(-1, 16), 6), axis=0).reshape(-1, 4, 4)
+    some = vertices_mm[:: max(1, len(vertices_mm) // 300)]
+    nearest = []
+    for i, pose in enumerate(distinct if len(distinct) > 1 else ()):
+        others = np.delete(distinct, i, axis=0)
+        nearest.append(add_mm(some, np.broadcast_to(pose, others.shape), others).min())
+    return np.array(nearest)
+
+
 def _share(hits: np.ndarray) -> float | None:
     return float(hits.mean()) if len(hits) else None
 

@@ -11,13 +11,12 @@ from .. import files
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.pose import transform
+from ..registration.confidence import GOOD_ADD_MM
 from ..registration.poses_file import Frame
 from ..registration.predictor import fitted_camera
 from .metrics import FrameErrors, add_accuracy, frame_errors, reliability, summary
 from .overlays import sheet, with_caption
 from .perturbations import FrameState, Perturbation, perturbations
-
-GOOD_ADD_MM = 3.0
 
 
 def choose(frames: Sequence[Frame], count: int, seed: int) -> list[Frame]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import files
 from ..appearances.store import folder_of, read_appearances
-from ..case.case import Case
+from ..case.case import Case, pose_settings
 from ..errors import InputError, Problems
 from ..executor import LOCAL, check_executor, run_jobs
 from ..geometry.camera import Camera
@@ -24,7 +24,7 @@ from ..registration.poses_file import Frame, read_poses, write_poses
 from ..registration.predictor import FORMAT_VERSION as MODEL_VERSION
 from .curves import curve_points
 from .evaluate import Evaluation, check_frame, check_out, compare, known_frames, overlay_images, register_frames
-from .metrics import add_auc, add_mm
+from .metrics import add_auc, nearest_other_pose_add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
 from .study_frames import FRAMES_PER_TEXTURE, check_unseen_poses, drawn_frames
@@ -195,8 +195,10 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
         )
     if settings.textures_study and len(styles) < LEFT_OUT:
         problems.add(f"{poses_path}: has frames of {len(styles)} textures; --textures-study tests on {LEFT_OUT}.")
+    chosen = [style for style in styles if settings.styles is None or style in settings.styles]
+    registered = styles if settings.textures_study else chosen
     for frame in frames:  # one that cannot be read would end the study after all its trainings
-        if frame.style in styles:
+        if frame.style in registered:
             with problems.collect():
                 check_frame(frame, camera)
     if settings.robustness and (case.model_folder / "model.onnx").is_file():
@@ -207,16 +209,11 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
     elif settings.robustness and not settings.protocols:
         problems.add(f"{folder}: has no model to test for robustness; run `train`, or study the protocol strict too.")
     problems.raise_if_any()
-    render = case.manifest["stages"].get("render", {})
     inputs = {
         "vessels_sha256": case.vessels_sha256,
         "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
         "poses_sha256": files.sha256(poses_path),
-        # Training draws its poses in these ranges, around the craniotomy.
-        "ranges": render.get("ranges"),
-        "craniotomy": render.get("craniotomy"),
-    }
-    chosen = [style for style in styles if settings.styles is None or style in settings.styles]
+    } | pose_settings(case.manifest)
     return StudyCase(case, poses_path, camera, frames, textures, styles, chosen, method, inputs)
 
 
@@ -400,15 +397,3 @@ def _write_overlays(one: StudyCase, evaluation: Evaluation, name: str) -> str:
     chosen = choose_frames(evaluation.errors.add_mm, evaluation.styles, 12)
     files.write_png(one.folder / f"overlays-{name}.png", sheet(overlay_images(one.case, evaluation, chosen)))
     return f"overlays-{name}.png"
-
-
-def nearest_other_pose_add_mm(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:
-    """ADD (P,) of answering, for each distinct pose, the nearest other one, chosen knowing the truth: what memory of
-    poses alone could reach. Empty for fewer than two distinct poses."""
-    distinct = np.unique(np.round(np.asarray(poses, float).reshape(-1, 16), 6), axis=0).reshape(-1, 4, 4)
-    some = vertices_mm[:: max(1, len(vertices_mm) // 300)]
-    nearest = []
-    for i, pose in enumerate(distinct if len(distinct) > 1 else ()):
-        others = np.delete(distinct, i, axis=0)
-        nearest.append(add_mm(some, np.broadcast_to(pose, others.shape), others).min())
-    return np.array(nearest)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .. import files
 from ..appearances.store import folder_of, read_appearances
-from ..case.case import Case
+from ..case.case import Case, pose_settings
 from ..errors import InputError
 from ..model.encoding import network_camera
 from ..model.views import ViewSettings, ViewSource
@@ -35,13 +35,12 @@ def drawn_frames(
     """
     method, appearances = read_appearances(case, method)
     folder = case.folder / "study" / "frames"
-    render = case.manifest["stages"].get("render", {})
     made_of = {
         "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
         "method": method,
         "per_texture": per_texture,
         "seed": seed,
-        "poses": {key: render.get(key) for key in ("ranges", "craniotomy")},
+        "poses": pose_settings(case.manifest),
     }
     path, record = folder / "poses.json", folder / "made_of.json"
     if path.is_file() and _known(record) == made_of:

@@ -86,15 +86,20 @@ def verdict(rows: list[Figures], limits: Limits) -> tuple[bool, tuple[str, ...]]
     row = deciding(rows)
     if row is None:
         return None
+    if row.accepted == 0:
+        return False, ("no view is accepted",)
     reasons = []
-    if row.accepted_add_mm is None or row.accepted_add_mm > limits.add_mm:
-        reasons.append(f"mean ADD of accepted views {_text(row.accepted_add_mm, 'mm')}, limit {limits.add_mm:.1f} mm")
+    if row.accepted_add_mm is None:
+        reasons.append("mean ADD of accepted views unknown, as of models of older versions: train again")
+    elif row.accepted_add_mm > limits.add_mm:
+        reasons.append(f"mean ADD of accepted views {row.accepted_add_mm:.2f} mm, limit {limits.add_mm:.1f} mm")
     for name, value, least in (
         ("of accepted views with ADD below 3 mm", row.accepted_right, limits.right_min),
         ("of views accepted", row.accepted, limits.accepted_min),
     ):
         if value is None or value < least:
-            reasons.append(f"{_text(value, '%')} {name}, at least {100 * least:.0f} % wanted")
+            share = "an unknown share" if value is None else f"{100 * value:.0f} %"
+            reasons.append(f"{share} {name}, at least {100 * least:.0f} % wanted")
     return not reasons, tuple(reasons)
 
 
@@ -113,9 +118,3 @@ def _of_metrics(protocol: str, style: str, metrics: dict) -> Figures:
         shown["add_mm"]["mean"],
         shown["add_below_3mm"],
     )
-
-
-def _text(value: float | None, unit: str) -> str:
-    if value is None:
-        return "unknown" if unit == "mm" else "an unknown share"
-    return f"{value:.2f} mm" if unit == "mm" else f"{100 * value:.0f} %"

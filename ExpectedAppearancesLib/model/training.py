@@ -18,9 +18,8 @@ import torch.nn.functional as F
 from .. import files
 from ..appearances.store import folder_of, read_appearances
 from ..cancelling import cancelling_waits
-from ..case.case import Case
+from ..case.case import Case, pose_settings
 from ..case.meshes import write_vtp
-from ..case.steps import POSES_DEPEND_ON
 from ..devices import fast_dtype
 from ..evaluation.metrics import add_mm
 from ..masks.exposed import exposed_vessels
@@ -96,8 +95,7 @@ def train_case(
     on_record = {"preset": preset.to_dict(), "seed": seed, "styles": trained_on, "held_out_styles": held_out}
     if fold is None:
         # With others, a training that is stopped would begin anew: who shows it must know.
-        render = case.manifest["stages"].get("render", {})
-        of = {"appearances_sha256": trainer.appearances_sha256, "poses": {k: render.get(k) for k in POSES_DEPEND_ON}}
+        of = {"appearances_sha256": trainer.appearances_sha256, "poses": pose_settings(case.manifest)}
         case.record("train", **on_record, **of, done=False)
     trainer.run(validation, progress)
     drawn = trainer.state["drawn"] * preset.fresh

@@ -100,11 +100,9 @@ def write_poses(
 def check_place(path: Path) -> None:
     """Raise InputError where `write_poses` could not write the file; makes nothing."""
     path = Path(path).absolute()
-    folder = files.existing_parent(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file in it, as poses.json.")
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"{folder}: nothing can be written here; choose a folder you may write to.")
+    files.require_writable(path.parent)
 
 
 def _camera(path: Path, value) -> Camera | None:

@@ -5,10 +5,10 @@ Leaving the module ends nothing. Closing a scene or Slicer does what the user ha
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Iterable
 from enum import Enum
 
+from .record import by_the_clock
 from .runner import CANCEL_DEADLINE_S, SWEEP_DEADLINE_S, Run
 from .state import RunState
 
@@ -32,17 +32,14 @@ def going_on(runs: Iterable[Run | None]) -> list[Run]:
 
 def question(runs: list[Run]) -> str:
     """What to ask the user about these runs."""
-    named = "\n".join(f"- {WORDS.get(run.kind, run.kind)} in {run.case_folder}, since {_clock(run)}" for run in runs)
+    named = "\n".join(
+        f"- {WORDS.get(run.kind, run.kind)} in {run.case_folder}, since {by_the_clock(run.started)}" for run in runs
+    )
     return (
         f"Work is going on in the background:\n{named}\n"
         "Let it go on? It is found again when the case is opened. If it is ended, what was finished is kept, and the "
         "next start goes on from there."
     )
-
-
-def _clock(run: Run) -> str:
-    """When it was started, by the clock of this computer."""
-    return f"{datetime.datetime.fromisoformat(run.started).astimezone():%Y-%m-%d %H:%M}"
 
 
 def close_runs(runs: Iterable[Run | None], choice: OnClose) -> dict[Run, RunState]:

@@ -199,9 +199,14 @@ def _holder(lock_path: Path) -> dict:
         return {}
 
 
+def by_the_clock(moment: str) -> str:
+    """A time of a record (ISO 8601, UTC) as the clock of this computer shows it."""
+    return f"{datetime.datetime.fromisoformat(moment).astimezone():%Y-%m-%d %H:%M}"
+
+
 def _occupied(folder: Path, name: str, holder: dict) -> str:
     who = ""
     if holder:
         where = "" if holder.get("host") == platform.node() else f" on {holder.get('host')}"
-        who = f" (process {holder.get('pid')}{where}, since {holder.get('since')})"
+        who = f" (process {holder.get('pid')}{where}, since {by_the_clock(holder['since'])})"
     return f"{folder}: {NAMES.get(name, name)} is going on in it{who}; wait until it has ended, or cancel it."

@@ -16,7 +16,7 @@ from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
 from . import processes
 from .environment import command_of, environment_of, python_for_runs
 from .output import OutputReader
-from .record import RunRecord, exclusive, read_record, update_record, write_record
+from .record import RunRecord, by_the_clock, exclusive, read_record, update_record, write_record
 from .results import remove_partial_files, result_problem
 from .state import RunState, RunStatus
 
@@ -69,7 +69,7 @@ class Run:
                 if _tree_of(previous).running():
                     raise InputError(
                         f"{folder}: a run of '{kind}' is going on in this case (process {previous.pid}, since "
-                        f"{previous.started}); wait until it has ended, or cancel it."
+                        f"{by_the_clock(previous.started)}); wait until it has ended, or cancel it."
                     )
                 if not previous.outcome:
                     _tree_of(previous).kill()  # orphans of a crash that nobody has seen
