@@ -126,3 +126,16 @@ def test_true_poses_of_a_camera_whose_distortion_was_taken_out_are_collected_in_
     other = recording.RecordedFrame(0.0, "f", camera.resized(160, 120), frame.prediction, noise(160, 120))
     with pytest.raises(InputError, match="another camera"):
         recording.add_truth(tmp_path, other, POSE)
+
+
+def test_true_poses_are_not_mixed_with_registered_ones_or_with_those_of_another_case(tmp_path):
+    frame = recording.RecordedFrame(0.0, "f", CAMERA, Prediction(POSE, True, 0.9, 1.0), noise())
+    another = recording.RecordedFrame(0.1, "g", CAMERA, frame.prediction, noise(seed=1))
+    recording.export_recording(tmp_path / "recording", [frame])
+    recording.add_truth(tmp_path / "true", frame, POSE, "a" * 64)
+    for folder, case, words in (("recording", "a", "registered, not true"), ("true", "b", "of another case")):
+        before = (tmp_path / folder / "poses.json").read_bytes()
+        with pytest.raises(InputError, match=words):
+            recording.add_truth(tmp_path / folder, another, POSE, case * 64)
+        assert (tmp_path / folder / "poses.json").read_bytes() == before
+    assert len(read_poses(recording.add_truth(tmp_path / "true", another, POSE, "a" * 64))[1]) == 2

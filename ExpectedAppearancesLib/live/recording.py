@@ -15,7 +15,7 @@ from .. import files
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.pose import is_rigid
-from ..registration.poses_file import read_poses, write_poses
+from ..registration.poses_file import check_vessels, read_poses, write_poses
 from ..registration.tracking import TrackedPose, TrackState
 from .steady import Steadied, View
 
@@ -150,11 +150,13 @@ def _known(confidence: float) -> float | None:
     return float(confidence) if math.isfinite(confidence) else None
 
 
-def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray) -> Path:
+def add_truth(
+    folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray, vessels_sha256: str | None = None
+) -> Path:
     """Add a frame with its true pose to folder/poses.json, as `evaluate` reads it; returns the path of the file. The
-    frame that was added last gets the new pose.
+    frame that was added last gets the new pose. vessels_sha256: of the case that it was aligned to.
 
-    Raises InputError when the file has another camera, or is damaged.
+    Raises InputError when the file has another camera or case, holds poses that were registered, or is damaged.
     """
     path = Path(folder) / "poses.json"
     entries = []
@@ -163,15 +165,20 @@ def add_truth(folder: Path, frame: RecordedFrame, camera_from_world: np.ndarray)
         # As dicts, since no distortion is read back as zeros.
         if camera is None or camera.to_dict() != frame.camera.to_dict():
             raise InputError(f"{path}: holds frames of another camera or size; choose another folder.")
+        if vessels_sha256:
+            check_vessels(path, vessels_sha256)
+        if any("accepted" in f.extra for f in known):
+            raise InputError(f"{path}: holds poses that were registered, not true ones; choose another folder.")
         entries = [f.to_dict() for f in known]
         last = known[-1].image
         if last.is_file() and np.array_equal(files.read_image_rgb(last), frame.image_rgb):
             entries[-1]["camera_from_world"] = camera_from_world
-            write_poses(path, frame.camera, entries)
+            write_poses(path, frame.camera, entries, vessels_sha256)
             return path
     number = len(entries)
     while (image := Path(folder) / "frames" / f"{number:05d}.png").exists():
         number += 1
     files.write_png(image, frame.image_rgb)
-    write_poses(path, frame.camera, [*entries, {"image": image, "camera_from_world": camera_from_world}])
+    entries.append({"image": image, "camera_from_world": camera_from_world})
+    write_poses(path, frame.camera, entries, vessels_sha256)
     return path

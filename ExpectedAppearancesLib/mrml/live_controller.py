@@ -300,7 +300,7 @@ class LiveController:
         """Add the frame with its true pose to folder/poses.json. Raises InputError."""
         if self.truth is None:
             raise InputError("true pose: there is none for this frame; align the vessels first.")
-        return add_truth(folder, _recorded(self.result), self.truth)
+        return add_truth(folder, _recorded(self.result), self.truth, self.case.vessels_sha256)
 
     # ---------------------------------------------------------------------------------------------------- recording
     def start_recording(self, limit_mb: float = live_record.DEFAULT_LIMIT_MB) -> None:
