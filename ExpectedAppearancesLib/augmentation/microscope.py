@@ -220,11 +220,10 @@ def _draw_blood(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     short_side = min(height, width)
     mask = np.zeros((height, width), np.uint8)
     angles = np.linspace(0, 2 * math.pi, 14, endpoint=False)
+    around = np.stack([np.cos(angles), np.sin(angles)], 1)
     for _ in range(rng.integers(1, 5)):
         radii = rng.uniform(0.03, 0.2) * short_side * rng.uniform(0.6, 1.4, 14)
-        outline = rng.uniform(0, 1, 2) * (width, height) + radii[:, None] * np.stack(
-            [np.cos(angles), np.sin(angles)], 1
-        )
+        outline = rng.uniform(0, 1, 2) * (width, height) + radii[:, None] * around
         cv2.fillPoly(mask, [np.rint(outline).astype(np.int32)], 255, cv2.LINE_AA)
     shades = rng.uniform(0.6, 1.4, (5, 5)).astype(np.float32)
     shade = cv2.resize(shades, (width, height), interpolation=cv2.INTER_CUBIC)

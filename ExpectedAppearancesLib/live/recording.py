@@ -170,15 +170,18 @@ def add_truth(
         if any("accepted" in f.extra for f in known):
             raise InputError(f"{path}: holds poses that were registered, not true ones; choose another folder.")
         entries = [f.to_dict() for f in known]
-        last = known[-1].image
-        if last.is_file() and np.array_equal(files.read_image_rgb(last), frame.image_rgb):
-            entries[-1]["camera_from_world"] = camera_from_world
-            write_poses(path, frame.camera, entries, vessels_sha256)
-            return path
-    number = len(entries)
-    while (image := Path(folder) / "frames" / f"{number:05d}.png").exists():
-        number += 1
-    files.write_png(image, frame.image_rgb)
-    entries.append({"image": image, "camera_from_world": camera_from_world})
+    if entries and _shows(known[-1].image, frame.image_rgb):
+        entries[-1]["camera_from_world"] = camera_from_world
+    else:
+        number = len(entries)
+        while (image := Path(folder) / "frames" / f"{number:05d}.png").exists():
+            number += 1
+        files.write_png(image, frame.image_rgb)
+        entries.append({"image": image, "camera_from_world": camera_from_world})
     write_poses(path, frame.camera, entries, vessels_sha256)
     return path
+
+
+def _shows(path: Path, image_rgb: np.ndarray) -> bool:
+    """Whether the file is there and holds this image."""
+    return path.is_file() and np.array_equal(files.read_image_rgb(path), image_rgb)

@@ -167,9 +167,10 @@ def export(browser, folder: Path, case: Case) -> Path:
     by_camera: dict = {}
     for item, (frame, _key) in enumerate(noted):
         by_camera.setdefault(frame.camera, []).append((item, frame))
-    if len(by_camera) <= 1:
-        return _export_part(browser, folder, case, list(enumerate(frame for frame, _key in noted)))
-    for number, part in enumerate(by_camera.values(), 1):
+    parts = list(by_camera.values()) or [[]]
+    if len(parts) == 1:
+        return _export_part(browser, folder, case, parts[0])
+    for number, part in enumerate(parts, 1):
         _export_part(browser, folder / f"camera_{number}", case, part)
     return folder
 
