@@ -141,7 +141,7 @@ planning.look_at_mask = MagicMock()
 looking, mask = panel.sections["poses"]._looking, MagicMock(GetID=lambda: "mask")
 
 def look():
-    looking._show_slice(mask, None, None, 1.0, "LPS")
+    list(looking._show_slice(mask, None, None, 1.0, "LPS"))
     assert list(shown.values()) == [None, None, "mask", 1.0]
 
 for chosen in (None, "MRI of the second"):

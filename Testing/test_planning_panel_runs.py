@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from panels import in_the_panel
 
+from ExpectedAppearancesLib.widgets.labels import set_percent
+
 
 def test_what_a_training_told_is_not_shown_for_another_case(tmp_path):
     in_the_panel(
@@ -192,3 +194,26 @@ panel.help.on_install()
 assert util.confirmOkCancelDisplay.call_count == 1
 """
     )
+
+
+def test_progress_is_painted_with_the_rest_of_the_window():
+    """QProgressBar paints as soon as its value changes: 40 ms in the midst of a refresh, of the whole window."""
+
+    class Bar:
+        """As QProgressBar, whose setValue repaints at once unless updates are off; switching them on paints later."""
+
+        updatesEnabled, painted_at_once, _value = True, 0, -1
+
+        @property
+        def value(self):
+            return self._value
+
+        @value.setter
+        def value(self, percent):
+            self._value = percent
+            self.painted_at_once += self.updatesEnabled
+
+    bar = Bar()
+    for percent in (3, 4, 4):
+        set_percent(bar, percent)
+        assert (bar.value, bar.updatesEnabled, bar.painted_at_once) == (percent, True, 0)

@@ -8,7 +8,7 @@ from slicer.i18n import tr as _
 
 from ..live.status import Status
 from . import live_texts
-from .labels import set_text
+from .labels import set_percent, set_text
 
 NUMBERS_S = 0.15  # the numbers are read, not watched: each new text lays out the panel
 
@@ -39,7 +39,7 @@ class StatusSection:
         self._numbers_due_s = time.monotonic() + NUMBERS_S
         confidence = status.confidence
         set_text(ui.confidenceLabel, "–" if confidence is None else f"{round(100 * confidence)} %")
-        ui.confidenceBar.value = 0 if confidence is None else round(100 * confidence)
+        set_percent(ui.confidenceBar, 0 if confidence is None else round(100 * confidence))
         latency_ms = status.latency_ms
         set_text(ui.latencyLabel, "–" if latency_ms is None else f"{latency_ms:.0f} ms")
         set_text(ui.ageLabel, live_texts.age(status.verdict.age_s))

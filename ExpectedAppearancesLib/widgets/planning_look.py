@@ -115,10 +115,10 @@ class Looking:
             scene, self._seen.get("camera"), planning.LOOKED_THROUGH, lines, planning.LOOKED_THROUGH_COLOUR, 2.0
         )
         yield
-        self._show_slice(volume, camera, pose, plane_mm, space)
+        yield from self._show_slice(volume, camera, pose, plane_mm, space)
         self._say(caption)
 
-    def _show_slice(self, volume, camera, pose, plane_mm: float, space: str) -> None:
+    def _show_slice(self, volume, camera, pose, plane_mm: float, space: str) -> Iterator[None]:
         scene = self.panel.scene
         slice_node = scene.GetNodeByID(f"vtkMRMLSliceNode{SLICE}")
         composite = scene.GetNodeByID(f"vtkMRMLSliceCompositeNode{SLICE}")
@@ -128,6 +128,7 @@ class Looking:
             self._slice_before = _SliceBefore(slice_node, composite)
         self._slice_before.notice(composite)
         planning.look_at_mask(slice_node, camera, pose, plane_mm, space)
+        yield
         modifying = composite.StartModify()
         composite.SetBackgroundVolumeID(None)
         composite.SetForegroundVolumeID(None)

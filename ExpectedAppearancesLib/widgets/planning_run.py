@@ -13,7 +13,7 @@ from ..errors import ExpectedAppearancesError
 from ..runs.record import refuse_if_occupied
 from ..runs.runner import Run
 from ..runs.state import RunState, RunStatus, controls
-from .labels import set_text
+from .labels import set_percent, set_text
 from .planning_qt import allow
 
 POLL_MS = 500
@@ -106,8 +106,8 @@ class RunControls:
         allow(self._cancel, state.cancel, _("End the run. What is finished is kept."))
         set_text(self._start, _(self._texts[state.action]))
         self._bar.visible = self.watch.active
-        self._bar.value = round(100 * status.fraction)
-        self._label.text = _line(status) or (problem if problem != said else "")
+        set_percent(self._bar, round(100 * status.fraction))
+        set_text(self._label, _line(status) or (problem if problem != said else ""))
         self._label.visible = bool(self._label.text)
 
 
