@@ -236,11 +236,11 @@ def _search(reach_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _along(points_px: np.ndarray, normals: np.ndarray, offsets_px: np.ndarray) -> np.ndarray:
     """Positions (E, K, 2) float32 at those offsets (K,) along the normals (2, E) of points (2, E)."""
-    x, y = (points_px[i][:, None] + normals[i][:, None] * offsets_px for i in range(2))
-    return cv2.merge([x.astype(np.float32), y.astype(np.float32)])
+    points_px, normals = (values.T.astype(np.float32)[:, None] for values in (points_px, normals))
+    return points_px + normals * offsets_px.astype(np.float32)[:, None]
 
 
 def _on_tissue(dark: np.ndarray, where: np.ndarray) -> np.ndarray:
     """bool (E,): whether no position (E, K, 2) of a point lies off the field."""
     off = cv2.remap(dark, where, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
-    return ~(off > 0).any(axis=1)
+    return ~off.any(axis=1)

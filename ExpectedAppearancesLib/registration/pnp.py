@@ -123,12 +123,14 @@ def projection_jacobian(turned: np.ndarray, seen: np.ndarray, focal: np.ndarray)
     turned (3, N): the points less their centre, in camera axes; seen (3, N): in the camera frame, mm.
     """
     x, y, z = turned
-    along, down = focal[:, None] / np.maximum(seen[2], 1.0)
-    along_by_depth, down_by_depth = -(np.stack([along, down]) ** 2) * seen[:2] / focal[:, None]
-    jacobian = np.zeros((6, 2, turned.shape[1]))
+    by_depth = 1 / np.maximum(seen[2], 1.0)
+    along, down = focal[0] * by_depth, focal[1] * by_depth
+    along_by_depth, down_by_depth = -along * (seen[0] * by_depth), -down * (seen[1] * by_depth)
+    jacobian = np.empty((6, 2, turned.shape[1]))
     jacobian[0, 0], jacobian[0, 1] = along_by_depth * y, down_by_depth * y - down * z
     jacobian[1, 0], jacobian[1, 1] = along * z - along_by_depth * x, -down_by_depth * x
     jacobian[2, 0], jacobian[2, 1] = -along * y, down * x
-    jacobian[3, 0], jacobian[4, 1] = along, down
+    jacobian[3, 0], jacobian[3, 1] = along, 0
+    jacobian[4, 0], jacobian[4, 1] = 0, down
     jacobian[5, 0], jacobian[5, 1] = along_by_depth, down_by_depth
     return jacobian
