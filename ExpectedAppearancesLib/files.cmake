@@ -161,6 +161,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/widgets/__init__.py
   ExpectedAppearancesLib/widgets/labels.py
   ExpectedAppearancesLib/widgets/live_align.py
+  ExpectedAppearancesLib/widgets/live_drawing.py
   ExpectedAppearancesLib/widgets/live_install.py
   ExpectedAppearancesLib/widgets/live_layout.py
   ExpectedAppearancesLib/widgets/live_panel.py

@@ -72,3 +72,58 @@ panel.align.close()
 interaction.SetCurrentInteractionMode.assert_not_called()  # the user's own picking goes on
 """
     )
+
+
+def test_each_3d_view_is_drawn_in_an_event_of_its_own_and_none_is_left_paused():
+    """All views in one call hold the GUI up; a view that stays paused is never drawn again."""
+    in_the_live_panel(
+        """
+import contextlib
+from ExpectedAppearancesLib.widgets.live_drawing import DrawnInTurn
+drawn = []
+
+class View:
+    paused = 0
+    def pauseRender(self):
+        self.paused += 1
+    def resumeRender(self):
+        self.paused -= 1
+        if not self.paused:
+            drawn.append(self)
+
+slices, first, second = views = View(), View(), View()
+slicer.app = MagicMock()
+slicer.app.pauseRender = lambda: [view.pauseRender() for view in views]
+slicer.app.resumeRender = lambda: [view.resumeRender() for view in views]
+manager = slicer.app.layoutManager.return_value
+manager.threeDViewCount = 2
+manager.threeDWidget = lambda i: MagicMock(threeDView=lambda: views[1 + i])
+
+drawing = DrawnInTurn()
+with drawing:
+    with drawing:
+        pass
+    assert not drawn
+assert drawn == [slices] and [view.paused for view in views] == [0, 1, 1]
+drawing._draw_next()
+assert drawn == [slices, first]
+with drawing:  # the next frame is there before the second view had its turn
+    assert drawn == [slices, first]
+drawing._draw_next()
+drawing._draw_next()
+assert drawn == [slices, first, slices, second, first] and not any(view.paused for view in views)
+with contextlib.suppress(RuntimeError), drawing:
+    raise RuntimeError
+drawing.finish()
+assert drawn[5:] == [slices, first, second] and not any(view.paused for view in views)
+
+def gone():
+    raise ValueError("Trying to call 'resumeRender' on a destroyed qMRMLThreeDView object")
+
+with drawing:
+    pass
+first.resumeRender = gone
+drawing.finish()
+assert drawn[-1] is second and not second.paused
+"""
+    )

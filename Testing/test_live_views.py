@@ -19,6 +19,7 @@ slicer = pytest.importorskip("slicer")
 import vtk  # noqa: E402
 from live_cases import choice_of, node_with, record, wait_for  # noqa: E402
 from mrml_views import SliceView, ThreeDView, new_application  # noqa: E402
+from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import live_views  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
@@ -128,16 +129,22 @@ def test_a_colour_window_that_the_user_sets_is_applied(watched):
     np.testing.assert_array_equal(mine, plain)
 
 
-def test_the_filled_vessels_are_a_layer_only_while_they_are_seen(case, watched):
+def test_hidden_vessels_leave_an_empty_layer_which_goes_with_the_users_wish_only(case, watched):
+    """A layer that comes and goes makes Slicer write the view's annotations anew, which holds the panel up."""
     live, views, ours, _layers = watched
-    views.follow(live, False)
-    assert ours.composite.GetLabelVolumeID() == live.fill.GetID()
-    live.show(result_of(case, accepted=False, seed=1))
-    views.follow(live, False)
-    assert ours.composite.GetLabelVolumeID() is None
-    live.show(result_of(case, seed=2))
-    views.follow(live, False)
-    assert ours.composite.GetLabelVolumeID() == live.fill.GetID()
+
+    def pixels() -> np.ndarray:
+        views.follow(live, False)
+        assert ours.composite.GetLabelVolumeID() == live.fill.GetID()
+        return vtk_to_numpy(live.fill.GetImageData().GetPointData().GetScalars())
+
+    for seed, accepted in ((1, True), (2, False), (3, True)):
+        live.show(result_of(case, accepted=accepted, seed=seed))
+        assert pixels().any() == accepted
+    live.set_overlay_visible(False)
+    assert not pixels().any()
+    live.set_overlay_visible(True)
+    assert pixels().any()
     live.set_options(OverlayOptions(fill=False))
     views.follow(live, False)
     assert ours.composite.GetLabelVolumeID() is None

@@ -67,6 +67,7 @@ class LiveScene:
         self.frame = node_of_role(scene, FRAME)
         self.frustum = None
         self.lines = {role: self._add_lines(role) for role in NAMES}
+        self._filled = np.zeros((2, 2), np.uint8)
         self.fill = self._add_fill()
         self.backdrop = None
 
@@ -150,7 +151,8 @@ class LiveScene:
         self._draw_lines(OUTLINE, camera, overlay.outline_px, overlay.outline_lines)
         self._draw_lines(BOX, camera, overlay.box_px, overlay.box_lines)
         was_modifying = self.fill.StartModify()
-        _set_image(self.fill, overlay.fill[..., None])
+        self._filled = overlay.fill
+        self._show_fill()
         self._place_fill(camera)
         self.fill.EndModify(was_modifying)
 
@@ -180,7 +182,9 @@ class LiveScene:
 
     def set_overlay_visible(self, visible: bool) -> None:
         """Show or hide all that depends on the pose: outline, fill, box and frustum."""
-        self.overlay_visible = visible
+        if visible != self.overlay_visible:
+            self.overlay_visible = visible
+            self._show_fill()
         _set_visible(self.lines[OUTLINE], visible and self.options.outline)
         _set_visible(self.lines[BOX], visible and self.options.box)
         if self.frustum is not None:
@@ -193,8 +197,8 @@ class LiveScene:
 
     @property
     def fill_opacity(self) -> float:
-        """Opacity for the views' label layer: 0 when the overlay is hidden or not wanted."""
-        return self.options.fill_opacity if self.overlay_visible and self.options.fill else 0.0
+        """Opacity of the label layer in the views: 0 when unwanted. It is empty where the overlay is hidden."""
+        return self.options.fill_opacity if self.options.fill else 0.0
 
     def set_options(self, options: OverlayOptions) -> None:
         self.options = options
@@ -265,6 +269,12 @@ class LiveScene:
         self.frame.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(self.camera, self.plane_mm)))
         self.frame.SetAndObserveTransformNodeID(self.transform.GetID())
 
+    def _show_fill(self) -> None:
+        """The filled vessels, or an empty layer while they are not to be seen. Taken off a view and put on again, the
+        layer would have Slicer write the view's annotations anew: 100 ms."""
+        filled = self._filled if self.overlay_visible else np.zeros_like(self._filled)
+        _set_image(self.fill, filled[..., None])
+
     def _place_fill(self, camera: Camera) -> None:
         small = camera.resized(*self.fill.GetImageData().GetDimensions()[:2])
         self.fill.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(small, self.plane_mm)))
@@ -305,7 +315,7 @@ class LiveScene:
     def _add_fill(self):
         colours = self._scene.AddNode(_colour_table())
         node = mark(self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "Predicted vessels"), FILL)
-        _set_image(node, np.zeros((2, 2, 1), np.uint8))
+        _set_image(node, self._filled[..., None])
         node.CreateDefaultDisplayNodes()
         node.GetDisplayNode().SetAndObserveColorNodeID(colours.GetID())
         node.SetAndObserveTransformNodeID(self.transform.GetID())

@@ -18,6 +18,7 @@ from ..mrml.mri import scan_to_show
 from . import live_install
 from .labels import set_text
 from .live_align import AlignSection
+from .live_drawing import DrawnInTurn
 from .live_layout import LayoutSection
 from .live_record import RecordSection
 from .live_source import SourceSection
@@ -35,7 +36,8 @@ class LivePanel:
 
     def __init__(self, ui, controller: LiveController):
         self.ui, self.controller = ui, controller
-        controller.drawing_held = slicer.util.RenderBlocker
+        self._drawing = DrawnInTurn()
+        controller.drawing_held = lambda: self._drawing
         self._parameter_node = None
         self._gui_tag = None
         self._message = ""
@@ -85,6 +87,7 @@ class LivePanel:
         self._timer.stop()
         self.stop()
         self.record.close()
+        self._drawing.finish()
         self.layout.leave()
 
     def close(self) -> None:
@@ -93,6 +96,7 @@ class LivePanel:
         self.align.close()
         self.record.close()
         self.controller.close()
+        self._drawing.finish()
         self.layout.leave()
         self.set_parameter_node(None)
 
