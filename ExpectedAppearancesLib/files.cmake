@@ -159,9 +159,9 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/proposal.py
   ExpectedAppearancesLib/textures/thumbnails.py
   ExpectedAppearancesLib/widgets/__init__.py
+  ExpectedAppearancesLib/widgets/drawing.py
   ExpectedAppearancesLib/widgets/labels.py
   ExpectedAppearancesLib/widgets/live_align.py
-  ExpectedAppearancesLib/widgets/live_drawing.py
   ExpectedAppearancesLib/widgets/live_install.py
   ExpectedAppearancesLib/widgets/live_layout.py
   ExpectedAppearancesLib/widgets/live_panel.py

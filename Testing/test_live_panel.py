@@ -74,16 +74,17 @@ interaction.SetCurrentInteractionMode.assert_not_called()  # the user's own pick
     )
 
 
-def test_each_3d_view_is_drawn_in_an_event_of_its_own_and_none_is_left_paused():
+def test_each_view_is_drawn_in_an_event_of_its_own_and_none_is_left_paused():
     """All views in one call hold the GUI up; a view that stays paused is never drawn again."""
     in_the_live_panel(
         """
 import contextlib
-from ExpectedAppearancesLib.widgets.live_drawing import DrawnInTurn
-drawn = []
+from ExpectedAppearancesLib.widgets import drawing
+drawn, events = [], []
+drawing.qt.QTimer = MagicMock(singleShot=lambda _ms, action: events.append(action))
 
 class View:
-    paused = 0
+    visible, paused = True, 0
     def pauseRender(self):
         self.paused += 1
     def resumeRender(self):
@@ -91,39 +92,46 @@ class View:
         if not self.paused:
             drawn.append(self)
 
-slices, first, second = views = View(), View(), View()
-slicer.app = MagicMock()
-slicer.app.pauseRender = lambda: [view.pauseRender() for view in views]
-slicer.app.resumeRender = lambda: [view.resumeRender() for view in views]
-manager = slicer.app.layoutManager.return_value
+views = plane, overview, through = View(), View(), View()
+hidden = View()
+hidden.visible = False
+drawing.slicer.app = MagicMock()
+drawing.slicer.app.pauseRender = lambda: [view.pauseRender() for view in views]
+drawing.slicer.app.resumeRender = lambda: [view.resumeRender() for view in views]
+manager = drawing.slicer.app.layoutManager.return_value
+manager.sliceViewNames.return_value = ["Microscope", "Hidden"]
+manager.sliceWidget = lambda name: MagicMock(sliceView=lambda: plane if name == "Microscope" else hidden)
 manager.threeDViewCount = 2
 manager.threeDWidget = lambda i: MagicMock(threeDView=lambda: views[1 + i])
 
-drawing = DrawnInTurn()
-with drawing:
-    with drawing:
+def event():
+    events.pop(0)()
+    assert len(events) <= 1  # one turn at a time
+
+held = drawing.DrawnInTurn()
+with held:
+    with held:
         pass
-    assert not drawn
-assert drawn == [slices] and [view.paused for view in views] == [0, 1, 1]
-drawing._draw_next()
-assert drawn == [slices, first]
-with drawing:  # the next frame is there before the second view had its turn
-    assert drawn == [slices, first]
-drawing._draw_next()
-drawing._draw_next()
-assert drawn == [slices, first, slices, second, first] and not any(view.paused for view in views)
-with contextlib.suppress(RuntimeError), drawing:
-    raise RuntimeError
-drawing.finish()
-assert drawn[5:] == [slices, first, second] and not any(view.paused for view in views)
+    assert not events
+assert not drawn
+event()
+assert drawn == [plane]
+event()
+with held:  # the next frame is there before the last view had its turn
+    pass
+assert drawn == [plane, overview]
+while events:
+    event()
+assert drawn == [plane, overview, through, plane, overview] and not any(view.paused for view in views)
 
 def gone():
     raise ValueError("Trying to call 'resumeRender' on a destroyed qMRMLThreeDView object")
 
-with drawing:
-    pass
-first.resumeRender = gone
-drawing.finish()
-assert drawn[-1] is second and not second.paused
+with contextlib.suppress(RuntimeError), held:
+    raise RuntimeError
+overview.resumeRender = gone
+while events:
+    event()
+assert drawn[5:] == [plane, through] and not plane.paused and not through.paused and not hidden.paused
 """
     )

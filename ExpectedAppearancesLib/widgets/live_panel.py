@@ -16,9 +16,9 @@ from ..mrml.live_controller import LiveController
 from ..mrml.live_scene import OverlayOptions
 from ..mrml.mri import scan_to_show
 from . import live_install
+from .drawing import DrawnInTurn
 from .labels import set_text
 from .live_align import AlignSection
-from .live_drawing import DrawnInTurn
 from .live_layout import LayoutSection
 from .live_record import RecordSection
 from .live_source import SourceSection
@@ -36,8 +36,8 @@ class LivePanel:
 
     def __init__(self, ui, controller: LiveController):
         self.ui, self.controller = ui, controller
-        self._drawing = DrawnInTurn()
-        controller.drawing_held = lambda: self._drawing
+        drawing = DrawnInTurn()
+        controller.drawing_held = lambda: drawing
         self._parameter_node = None
         self._gui_tag = None
         self._message = ""
@@ -87,7 +87,6 @@ class LivePanel:
         self._timer.stop()
         self.stop()
         self.record.close()
-        self._drawing.finish()
         self.layout.leave()
 
     def close(self) -> None:
@@ -96,7 +95,6 @@ class LivePanel:
         self.align.close()
         self.record.close()
         self.controller.close()
-        self._drawing.finish()
         self.layout.leave()
         self.set_parameter_node(None)
 

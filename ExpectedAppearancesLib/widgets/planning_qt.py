@@ -15,6 +15,7 @@ import qt
 from ..case.steps import Step, StepState
 from ..runs.environment import WITHOUT_WINDOW, environment_of, python_for_runs
 from ..runs.worker import Worker
+from .drawing import DrawnInTurn
 from .labels import set_text
 
 # Readable on light and on dark themes.
@@ -34,6 +35,8 @@ SYMBOLS = {
 }
 STEP_BUDGET_S = 0.015
 POLL_ANSWER_MS = 15
+
+_drawing = DrawnInTurn()
 
 
 def allow(button, reason: str, otherwise: str) -> None:
@@ -102,6 +105,12 @@ class Stepper:
         return self._steps is not None
 
     def _work(self) -> None:
+        with _drawing:
+            self._step()
+        if self._steps is not None:
+            self._timer.start()
+
+    def _step(self) -> None:
         steps, end = self._steps, time.monotonic() + STEP_BUDGET_S
         while steps is not None and steps is self._steps and time.monotonic() < end:
             try:
@@ -113,8 +122,6 @@ class Stepper:
             except Exception:
                 self._steps = None
                 raise
-        if self._steps is not None:
-            self._timer.start()
 
 
 class Asking:
