@@ -45,7 +45,7 @@ class Views(Protocol):
 class LiveController:
     """Owns the session, its nodes in `scene`, the recording and the alignment. `close` leaves nothing behind.
 
-    drawing_held: gives the context in which no view is drawn, in Slicer slicer.util.RenderBlocker.
+    drawing_held: gives the context in which no view is drawn, in Slicer widgets.drawing.DrawnInTurn.
     """
 
     def __init__(self, scene, views: Views | None = None, clock: Callable[[], float] = time.monotonic):
