@@ -394,6 +394,21 @@ def test_a_damaged_checkpoint_is_not_gone_on_from(trained):
     assert train_case(trained, replace(TINY, steps=2), lambda *_: None, CPU, method="surface")["steps"] == 2
 
 
+@pytest.mark.skipif(not hasattr(psutil.Process, "memory_maps"), reason="this system does not tell what is mapped")
+def test_a_training_that_goes_on_holds_nothing_of_its_checkpoint(tmp_path):
+    """Windows replaces no file that is mapped into memory: the next checkpoint could not be written."""
+    network = torch.nn.Linear(3, 2)
+    optimizer = torch.optim.AdamW(network.parameters())
+    network(torch.ones(1, 3)).sum().backward()
+    optimizer.step()
+    weights = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    checkpoint.save(tmp_path, network, weights, weights, optimizer, {"settings": {}})
+    average, _best, _state = checkpoint.load(tmp_path, network, optimizer, {})
+    torch.testing.assert_close(average, weights)
+    mapped = [area.path for area in psutil.Process().memory_maps()]
+    assert not [path for path in mapped if "checkpoint.safetensors" in path]
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no limit for the size of files")
 def test_a_checkpoint_that_does_not_fit_on_the_disk_is_told_in_words(tmp_path):
     """The library that writes it has an error of its own for that, which names no file and no way out."""

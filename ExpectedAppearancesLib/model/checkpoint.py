@@ -42,7 +42,8 @@ def load(folder: Path, network, optimizer, settings: dict) -> tuple[dict, dict, 
             state = json.loads((stream.metadata() or {}).get("state", "null"))
             if not state or state.get("settings") != settings:
                 return None
-            tensors = {key: stream.get_tensor(key) for key in stream.keys()}  # noqa: SIM118 (not a dict)
+            # Copies: the tensors are the mapped file itself, which Windows lets nobody replace by the next checkpoint.
+            tensors = {key: stream.get_tensor(key).clone() for key in stream.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, ValueError, OSError):
         return None
     parts = {"network": {}, "average": {}, "best": {}}
