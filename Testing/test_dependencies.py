@@ -34,12 +34,12 @@ def wanted(monkeypatch) -> Package:
     return package
 
 
-def write_wheel(folder: Path, version: str = "2.1", tag: str = "py3-none-any") -> None:
+def write_wheel(folder: Path, version: str = "2.1", tag: str = "py3-none-any", needs: str = "") -> None:
     folder.mkdir(exist_ok=True)
     info = f"{MODULE}-{version}.dist-info"
     with zipfile.ZipFile(folder / f"{MODULE}-{version}-{tag}.whl", "w") as wheel:
         wheel.writestr(f"{MODULE}.py", "raise SystemExit('imported')\n")
-        wheel.writestr(f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {NAME}\nVersion: {version}\n")
+        wheel.writestr(f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {NAME}\nVersion: {version}\n{needs}")
         wheel.writestr(f"{info}/WHEEL", f"Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: {tag}\n")
         wheel.writestr(f"{info}/RECORD", "")
 
@@ -131,6 +131,15 @@ def test_a_folder_without_the_right_wheel_is_named_with_what_it_lacks(wanted, tm
         dependencies.install("test", tmp_path / "wheels", lambda _names: True, lambda _text: None)
     assert words in str(raised.value) and NAME in str(raised.value) and str(tmp_path / "wheels") in str(raised.value)
     assert "No matching distribution" in raised.value.log
+
+
+def test_wheels_for_another_numpy_are_told_with_the_one_to_download_them_for(wanted, tmp_path, pip_into):
+    """The newest OpenCV wants a newer numpy than Slicer's: whoever downloaded what is listed had no way to go on."""
+    write_wheel(tmp_path / "wheels", needs="Requires-Dist: numpy>=99\n")
+    with pytest.raises(InstallError) as raised:
+        dependencies.install("test", tmp_path / "wheels", lambda _names: True, lambda _text: None)
+    assert f"pip download numpy=={metadata.version('numpy')} " in str(raised.value)
+    assert str(tmp_path / "wheels") in str(raised.value)
 
 
 def test_a_folder_without_wheels_is_refused_before_asking(wanted, tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 _NO_MATCH = re.compile(r"No matching distribution found for ([^\s]+)")
 _VERSIONS = re.compile(r"\(from versions: ([^)]*)\)")
 _CONFLICT = re.compile(r"ResolutionImpossible|conflicting dependencies")
+_KEPT = re.compile(r"The user requested \(constraint\) ([^\s]+)")
 
 
 def explanation(log: str, requirements: list[str], wheels_folder: Path | None) -> str:
@@ -46,6 +47,12 @@ def explanation(log: str, requirements: list[str], wheels_folder: Path | None) -
             return f"{wheels_folder}: lacks a wheel of {name} for this Python and this system; add it."
         return f"{name}: the package index has none for this Python and this system; update the program."
     if _CONFLICT.search(log):
+        kept = " ".join(sorted(set(_KEPT.findall(log))))
+        if wheels_folder is not None and kept:
+            return (
+                f"{wheels_folder}: its wheels do not fit to {kept}, which must stay as it is here; download them again "
+                f"together with it: pip download {kept} ..."
+            )
         return (
             f"{wanted}: no versions fit to what is installed here, which must stay as it is; uninstall other packages "
             "that were added to this Python, or update the program."
