@@ -34,6 +34,26 @@ assert "no folder" in panel._message, panel._message
     )
 
 
+def test_packages_are_installed_once_however_often_it_is_clicked():
+    """Slicer 5.8 works off what was clicked meanwhile at each line that pip prints: it asked, and installed, again."""
+    in_the_live_panel(
+        """
+from ExpectedAppearancesLib.widgets import live_install
+begun = []
+
+def install(say):
+    begun.append(say)
+    panel.install()
+
+live_install.install = install
+panel.install()
+assert len(begun) == 1
+panel.install()
+assert len(begun) == 2
+"""
+    )
+
+
 def test_the_overview_is_laid_out_for_each_case():
     """Two patients in turn: the second one's head may lie anywhere else."""
     in_the_live_panel(

@@ -196,6 +196,31 @@ assert util.confirmOkCancelDisplay.call_count == 1
     )
 
 
+def test_packages_are_installed_once_however_often_it_is_clicked():
+    """Slicer 5.8 works off what was clicked meanwhile at each line that pip prints: pip was started again within."""
+    in_the_panel(
+        """
+import contextlib
+from ExpectedAppearancesLib.widgets import planning_help
+planning_help.slicer.util.tryWithErrorDisplay = lambda *_, **__: contextlib.nullcontext()
+missing, begun = {"planning": ["filelock>=3.12"], "training": []}, []
+
+def install(kind, *_):
+    begun.append(kind)
+    panel.help.on_install()
+    panel.help.refresh()
+    assert "being installed" in panel.ui.installButton.toolTip
+    missing["planning"] = []
+    return True
+
+planning_help.dependencies.missing, planning_help.dependencies.install = missing.get, install
+panel.help.enter()
+panel.help.on_install()
+assert begun == ["planning", "training"], begun
+"""
+    )
+
+
 def test_progress_is_painted_with_the_rest_of_the_window():
     """QProgressBar paints as soon as its value changes: 40 ms in the midst of a refresh, of the whole window."""
 

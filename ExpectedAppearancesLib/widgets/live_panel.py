@@ -44,6 +44,7 @@ class LivePanel:
         self._problem = ""
         self._starting = False
         self._missing = live_install.problem()
+        self._installing = False
         self._ticks = 0
         self._fit_due = False
         self._buttons: tuple | None = None
@@ -212,7 +213,13 @@ class LivePanel:
             self.start(single=True)
 
     def install(self) -> None:
-        live_install.install(self.say)
+        if self._installing:  # Slicer answers to clicks while pip is at work
+            return
+        self._installing = True
+        try:
+            live_install.install(self.say)
+        finally:
+            self._installing = False
         self.refresh()
 
     def tick_now(self) -> None:
