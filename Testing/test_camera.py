@@ -104,6 +104,18 @@ def test_damaged_opencv_calibration_is_bad_input(tmp_path):
             read_camera(path)
 
 
+@pytest.mark.parametrize("name", ["camera.json", "calibration.yml"])
+def test_a_calibration_that_may_not_be_read_is_bad_input(tmp_path, monkeypatch, name):
+    (tmp_path / name).touch()
+
+    def refused(*_arguments, **_named):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(tmp_path), "read_text", refused)
+    with pytest.raises(InputError, match=rf"{name}.*Permission denied"):
+        read_camera(tmp_path / name)
+
+
 def test_all_problems_of_a_camera_are_reported_at_once(tmp_path):
     with pytest.raises(InputError) as caught:
         Camera.from_dict(

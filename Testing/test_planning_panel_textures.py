@@ -70,6 +70,26 @@ assert panel.parameters.texturesPath == "" and textures.labelling._name == ""
     )
 
 
+def test_a_folder_that_may_not_be_looked_into_is_told(tmp_path):
+    """Of a share, or guarded by macOS: the system's error came from every look at the textures, and nothing went on."""
+    in_the_panel(
+        """
+import os
+from pathlib import Path
+
+def refused(*_):
+    raise PermissionError(1, "Operation not permitted")
+
+panel.parameters.texturesPath = sys.argv[2]
+Path.iterdir = os.listdir = os.scandir = refused
+panel.refresh()
+step = panel.steps["textures"]
+assert step.state.value == "missing" and "Operation not permitted" in step.text and sys.argv[2] in step.text, step
+""",
+        tmp_path,
+    )
+
+
 def test_the_shipped_textures_are_known_however_their_path_is_written(tmp_path):
     """Qt writes paths with other slashes than Windows; taken for the user's own they could be deleted."""
     in_the_panel(

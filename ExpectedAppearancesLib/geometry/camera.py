@@ -160,7 +160,7 @@ def _read_opencv_calibration(path: Path) -> Camera:
         matrix = storage.getNode("camera_matrix").mat()
         distortion = storage.getNode("distortion_coefficients").mat()
         width, height = (storage.getNode(key).real() for key in ("image_width", "image_height"))
-    except (cv2.error, SystemError, UnicodeDecodeError) as error:
+    except (cv2.error, SystemError, UnicodeDecodeError, OSError) as error:
         raise InputError(
             f"{path}: not an OpenCV calibration file ({error}); save it with OpenCV's calibration."
         ) from error

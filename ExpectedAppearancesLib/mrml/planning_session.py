@@ -19,7 +19,7 @@ from ..evaluation.verdict import Limits
 from ..geometry.camera import Camera, read_camera, write_camera
 from ..poses.craniotomy import Craniotomy, find_craniotomy, has_own_axis
 from ..poses.sampling import PoseRanges, PoseSampler
-from ..textures.library import list_textures, names_taken_twice, shipped_textures_folder
+from ..textures.library import list_textures, problems_of_folder, shipped_textures_folder
 from . import mri, planning
 from .segment_surface import SegmentSurfaces, segment_version
 
@@ -343,7 +343,7 @@ class PlanningSession:
             return {}, f"{folder}: is no longer there; choose another folder."
         found = self.texture_files(parameters)
         bad = [self.texture_problems[version] for version, *_ in found.values() if version in self.texture_problems]
-        bad = names_taken_twice(folder) + bad
+        bad = problems_of_folder(folder) + bad
         return {name: self.texture_digests.get(version, "") for name, (version, *_) in found.items()}, "\n".join(bad)
 
     def _once(self, name: str, version, make):

@@ -138,8 +138,8 @@ def list_textures(folder: Path) -> dict[str, tuple[Path, Path | None]]:
     return {name: (images[name], next((path for path in paths if path.is_file()), None)) for name, paths in labels}
 
 
-def names_taken_twice(folder: Path) -> list[str]:
-    """Problems of a folder in which two images would be the same texture, such as a.png and a.jpg."""
+def problems_of_folder(folder: Path) -> list[str]:
+    """Of one that cannot be read, or in which two images would be the same texture, such as a.png and a.jpg."""
     return _named_images(Path(folder))[1]
 
 
@@ -199,7 +199,11 @@ def _named_images(folder: Path) -> tuple[dict[str, Path], list[str]]:
     """Images by name, the last one where several have it, and which these are."""
     images: dict[str, Path] = {}
     problems = []
-    for path in sorted(folder.iterdir()):
+    try:
+        paths = sorted(folder.iterdir())
+    except OSError as error:  # a share that others may look into, or one of those that macOS guards
+        return {}, [f"{folder}: cannot be read ({error.strerror or error}); choose a folder that you may look into."]
+    for path in paths:
         is_labels = path.name.lower() == SHARED_LABELS or path.name.lower().endswith(LABELS_SUFFIX)
         if path.suffix.lower() not in IMAGE_SUFFIXES or is_labels or path.name.startswith("."):
             continue
