@@ -54,7 +54,7 @@ textures = panel.sections["textures"]
 def refused(*_arguments, **_named):
     raise PermissionError(13, "Permission denied")
 
-Path.unlink = planning_textures.copy_shipped_textures.__globals__["shutil"].copyfile = refused
+Path.unlink = planning_textures.copy_textures.__globals__["shutil"].copyfile = refused
 panel.parameters.texturesPath = sys.argv[2]
 panel.ui.texturesList.selectedItems.return_value = [MagicMock(data=lambda role: "a")]
 textures.on_remove()
@@ -85,6 +85,40 @@ Path.iterdir = os.listdir = os.scandir = refused
 panel.refresh()
 step = panel.steps["textures"]
 assert step.state.value == "missing" and "Operation not permitted" in step.text and sys.argv[2] in step.text, step
+""",
+        tmp_path,
+    )
+
+
+def test_the_textures_of_the_case_before_stay_as_they_are(tmp_path):
+    """Chosen still after New: a photograph for the second patient went to the first one's, and Remove deleted those."""
+    for patient in ("first", "second"):
+        (tmp_path / patient).mkdir()
+        (tmp_path / patient / "case.json").touch()
+    own = tmp_path / "first" / "textures"
+    own.mkdir()
+    (own / "a.png").write_bytes(b"a")
+    in_the_panel(
+        """
+from pathlib import Path
+from ExpectedAppearancesLib.widgets import planning_labelling, planning_textures
+planning_labelling.Child = MagicMock()
+planning_textures.slicer.util = MagicMock()
+first, second = (Path(sys.argv[2]) / name for name in ("first", "second"))
+textures, p = panel.sections["textures"], panel.parameters
+panel.ui.texturesList.selectedItems.return_value = [MagicMock(data=lambda role: "a")]
+panel.session.case = lambda p: MagicMock(folder=Path(p.casePath))
+panel.ui.removeTextureButton.enabled = True
+for case, reason in ((first, ""), (second, "another case")):
+    p.texturesPath, p.casePath = str(first / "textures"), str(case)
+    textures.labelling._name = ""
+    textures.refresh()
+    assert panel.ui.removeTextureButton.enabled == (not reason), case
+    assert reason in panel.ui.removeTextureButton.toolTip
+    textures.on_add("/photographs/b.png")
+    assert textures.labelling._textures == case / "textures", textures.labelling._textures
+    assert p.texturesPath == str(case / "textures")
+    assert (case / "textures" / "a.png").read_bytes() == b"a"
 """,
         tmp_path,
     )

@@ -17,7 +17,7 @@ from ExpectedAppearancesLib.runs.environment import library_environment
 from ExpectedAppearancesLib.textures import generate, thumbnails
 from ExpectedAppearancesLib.textures.library import (
     Texture,
-    copy_shipped_textures,
+    copy_textures,
     list_textures,
     read_library,
     read_texture,
@@ -203,7 +203,7 @@ def test_shipped_textures_are_copied_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(shutil, "copyfile", full_disk)
     with pytest.raises(InputError, match="textures: cannot be written"):
-        copy_shipped_textures(tmp_path / "textures")
+        copy_textures(shipped_textures_folder(), tmp_path / "textures")
     assert not any(tmp_path.iterdir())
-    copy_shipped_textures(tmp_path / "textures")
+    copy_textures(shipped_textures_folder(), tmp_path / "textures")
     assert list_textures(tmp_path / "textures").keys() == list_textures(shipped).keys()

@@ -55,8 +55,8 @@ def is_shipped(folder: Path) -> bool:
     return Path(folder).resolve() == shipped_textures_folder().resolve()
 
 
-def copy_shipped_textures(folder: Path) -> None:
-    """Make `folder`, to which photographs can be added, of the textures that ship; whole or not at all.
+def copy_textures(source: Path, folder: Path) -> None:
+    """Make `folder`, to which photographs can be added, of the textures in another one; whole or not at all.
 
     Raises InputError where it cannot be written.
     """
@@ -64,7 +64,7 @@ def copy_shipped_textures(folder: Path) -> None:
     try:
         with files.writing(folder):
             part.mkdir(parents=True)
-            for path in shipped_textures_folder().iterdir():
+            for path in filter(Path.is_file, source.iterdir()):
                 shutil.copyfile(path, part / path.name)  # without its rights: an installed one may be read-only
             part.rename(folder)
     finally:

@@ -11,11 +11,12 @@ import slicer
 from slicer.i18n import tr as _
 
 from .. import files
+from ..case.case import MANIFEST_NAME
 from ..errors import InputError
 from ..textures import thumbnails
 from ..textures.library import (
     LABELS_SUFFIX,
-    copy_shipped_textures,
+    copy_textures,
     is_shipped,
     list_textures,
     shipped_textures_folder,
@@ -61,6 +62,8 @@ class TexturesSection(Section):
         reason = ""
         if shipped:
             reason = _("The shipped textures cannot be removed. Choose a folder of your own.")
+        elif self._of_another_case():
+            reason = _("These are the textures of another case. Open that one to remove any of them.")
         elif not ui.texturesList.selectedItems():
             reason = _("Click on a texture first.")
         allow(ui.removeTextureButton, reason, _("Delete the texture and its labels from the folder."))
@@ -161,9 +164,10 @@ class TexturesSection(Section):
         self.labelling.start(name, Path(path), folder)
 
     def _own_folder(self) -> bool:
-        """A folder that photographs can be added to: the chosen one, else one in the case with the shipped textures."""
+        """A folder that photographs can be added to: the chosen one, else one in the case, with the textures that ship
+        or that are another case's."""
         p = self.parameters
-        if p.texturesPath:
+        if p.texturesPath and not self._of_another_case():
             writable = os.path.isdir(p.texturesPath) and os.access(p.texturesPath, os.W_OK)
             if not writable:  # told now, not after the labelling
                 text = _("{folder}: you may not write into it. Choose a folder of your own, or the shipped textures.")
@@ -178,12 +182,18 @@ class TexturesSection(Section):
         folder = case.folder / OWN_TEXTURES
         if not folder.is_dir():
             try:
-                copy_shipped_textures(folder)
+                copy_textures(self.session.textures_folder(p), folder)
             except InputError as error:
                 slicer.util.errorDisplay(str(error))
                 return False
         changed(p, "texturesPath", str(folder))
         return True
+
+    def _of_another_case(self) -> bool:
+        """Whether the chosen textures lie in a case that is not the one that is open, as after New."""
+        p = self.parameters
+        case = os.path.dirname(os.path.realpath(p.texturesPath))
+        return os.path.isfile(os.path.join(case, MANIFEST_NAME)) and case != os.path.realpath(p.casePath)
 
     def on_remove(self) -> None:
         folder = self.session.textures_folder(self.parameters)
