@@ -252,6 +252,13 @@ def test_torch_comes_through_its_extension_except_from_a_folder(slicer, monkeypa
         dependencies.install("test", None, lambda _names: True, lambda _text: None)
 
 
+def test_check_knows_every_package_that_serves_as_well():
+    """It told to install a second OpenCV beside the one that other extensions bring, which spoils both."""
+    known = {name for names, _needed_by in check.PACKAGES for name in names}
+    for package in dependencies.REQUIREMENTS["registration"]:
+        assert {package.name, *package.others} <= known, package
+
+
 def test_report_for_a_mail_holds_what_check_says_and_slicers_version(slicer, monkeypatch):
     monkeypatch.setattr(check, "_run_python", lambda _source: (0, "[]", ""))
     report = system_report(check.make_report())

@@ -24,8 +24,11 @@ Exit code 0 when everything needed is there, 1 otherwise."""
 PACKAGES = (
     (("numpy",), "every command"),
     (("vtk", "slicer-core"), "every command"),
-    (("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless"), "every command"),
-    (("onnxruntime", "onnxruntime-gpu"), "register"),
+    (
+        ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
+        "every command",
+    ),
+    (("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml"), "register"),
     (("torch",), "synthesize and train"),
     (("safetensors",), "synthesize and train"),
     (("onnx",), "train"),
