@@ -382,6 +382,24 @@ def test_a_folder_that_vanishes_is_said_and_found_again(tmp_path):
     assert feed.stop()
 
 
+def test_a_network_drive_that_is_lost_is_tried_again(tmp_path, video, vanish):
+    """Its answer to every look is an error of the system, which ended the feed for good, and each look of the panel."""
+    write_images(tmp_path, ["1.png"])
+    chosen = [tmp_path, video, tmp_path / "poses.json"]
+    folder = sources.ImageFiles(tmp_path)
+    folder.open()
+    vanish(tmp_path)
+    vanish(video.parent)
+    with pytest.raises(sources.SourceLost, match="cannot be read"):
+        folder.read()
+    for source in (folder, sources.VideoFile(video)):
+        with pytest.raises(sources.SourceLost, match="wait for its drive"):
+            source.open()
+    for path in chosen:
+        found = problems_of(Choice(case_path=str(tmp_path / "case"), path=str(path), camera_path=str(tmp_path / "c")))
+        assert len(found) == 3 and "not a case" in found[0] and "its drive" in found[1], found
+
+
 def test_choice_lists_all_that_is_missing_and_opens_what_is_there(tmp_path, video):
     found = problems_of(Choice(path=str(tmp_path / "none"), camera_path=str(tmp_path / "c.json")))
     assert len(found) == 3 and "case" in found[0] and "none" in found[1] and "c.json" in found[2]

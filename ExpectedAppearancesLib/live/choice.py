@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -67,12 +68,12 @@ class OpenedSource:
 
 def problems_of(choice: Choice) -> list[str]:
     """Everything that keeps the choice from being started, cheap enough to ask at each keystroke."""
-    found = []
+    found = []  # os.path and not pathlib, whose answer on a network drive that is gone is an error
     if not choice.case_path:
         found.append("Choose the folder of a case.")
-    elif not (Path(choice.case_path) / MANIFEST_NAME).is_file():
+    elif not os.path.isfile(Path(choice.case_path) / MANIFEST_NAME):
         found.append(f"{choice.case_path} is not a case folder: it holds no {MANIFEST_NAME}.")
-    elif choice.needs_model and not (Path(choice.case_path) / "model" / "model.onnx").is_file():
+    elif choice.needs_model and not os.path.isfile(Path(choice.case_path) / "model" / "model.onnx"):
         found.append(
             f"The case {Path(choice.case_path).name} has no trained model yet; train it in the planning module."
         )
@@ -82,7 +83,7 @@ def problems_of(choice: Choice) -> list[str]:
         found.append("Give the number of the capture device (the first is 0), or the address of a stream.")
     elif choice.kind is SourceKind.NODE and not choice.node_name:
         found.append("Choose the volume that holds the microscope's picture.")
-    if choice.camera_path and not Path(choice.camera_path).is_file():
+    if choice.camera_path and not os.path.isfile(choice.camera_path):
         found.append(f"{choice.camera_path}: camera file not found; choose it again, or none for the case's.")
     return found
 
@@ -131,9 +132,9 @@ def _problems_of_path(text: str) -> list[str]:
     if not text:
         return ["Choose a folder of images, an image, a video, or a poses.json."]
     path = Path(text)
-    if not path.exists():
+    if not os.path.exists(path):
         return [f"{text}: not found; check the path, or wait for its drive to return."]
-    if path.is_file() and path.suffix.lower() not in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, ".json"):
+    if os.path.isfile(path) and path.suffix.lower() not in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, ".json"):
         return [_unknown(path)]
     return []
 

@@ -81,7 +81,7 @@ class ImageFiles:
         self._unfinished: dict[Path, tuple[tuple, float]] = {}
 
     def open(self) -> None:
-        if self._folder and not self._folder.is_dir():
+        if self._folder and not os.path.isdir(self._folder):  # unlike pathlib's, False on a network drive that is gone
             raise SourceLost(f"{self._folder}: folder not found; check the path, or wait for its drive to return.")
         if not self._folder and not self._listed:
             raise InputError("no images are listed; give at least one.")
@@ -106,7 +106,7 @@ class ImageFiles:
                 self._number += 1
                 image = _decoded(data, path)
                 return LiveFrame(image, self._clock(), self._number - 1, path.name, self._given.get(path))
-            if path.exists():
+            if os.path.exists(path):
                 self._next.append(path)  # in order: those after it wait
             else:
                 self._next, self._were_there = [], True
@@ -153,7 +153,7 @@ class ImageFiles:
             version = (state.st_size, state.st_mtime_ns)
             data = path.read_bytes()
         except OSError as error:  # locked by its writer, renamed, or never to be read
-            if not self._folder and not path.exists():
+            if not self._folder and not os.path.exists(path):
                 self._seen.add(str(path))
                 raise InputError(f"{path}: image not found; check the path.") from error
             trouble = f"cannot be read ({error.strerror})"
@@ -192,7 +192,7 @@ class VideoFile:
         self._capture = None
 
     def open(self) -> None:
-        if not self._path.is_file():
+        if not os.path.isfile(self._path):
             raise SourceLost(f"{self._path}: video not found; check the path, or wait for its drive to return.")
         import cv2
 
