@@ -28,6 +28,7 @@ from ExpectedAppearancesLib.case.steps import (
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.evaluation import metrics
 from ExpectedAppearancesLib.evaluation.verdict import Limits, figures_of_model, figures_of_study, verdict
+from ExpectedAppearancesLib.model.presets import PRESETS
 
 MISSING, READY, RUNNING, STALE, DONE = StepState
 CRANIOTOMY = {"centre_world_mm": [1.0, 2.0, 3.0], "outward_axis": [0.0, 0.0, 1.0], "up": [0.0, 1.0, 0.0]}
@@ -203,6 +204,24 @@ def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
     ):
         step = plan_steps(replace(chosen, preset=preset, minutes=minutes), recorded)["training"]
         assert step.state is READY and words in step.text
+
+
+@pytest.mark.parametrize(
+    ("preset", "changed", "seed", "words"),
+    [
+        ("quick", {}, 0, "Continue goes on from there"),
+        ("quick", {}, 3, "the seed; so it begins anew"),
+        ("quick", {"steps": 5000}, 0, "the number of steps; so it begins anew"),
+        ("paper", {"steps": 5000}, 0, "Continue goes on from there"),
+    ],
+)
+def test_a_training_that_was_started_outside_the_panel_says_that_it_begins_anew(preset, changed, seed, words):
+    """The command-line module and the command have options that the panel does not give."""
+    chosen, recorded = finished()
+    recorded = with_stage(replace(recorded, steps_trained=70), "train", done=False, seed=seed)
+    recorded.manifest["stages"]["train"]["preset"] = PRESETS[preset].to_dict() | changed
+    step = plan_steps(replace(chosen, preset=preset), recorded)["training"]
+    assert step.state is READY and words in step.text
 
 
 @pytest.mark.parametrize(

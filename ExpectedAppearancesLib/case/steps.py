@@ -11,6 +11,7 @@ from enum import Enum
 import numpy as np
 
 from ..geometry.camera import Camera
+from ..model.presets import PRESETS
 from .case import pose_settings
 
 STEPS = ("case", "microscope", "poses", "textures", "appearances", "training", "validation")
@@ -301,6 +302,7 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
                 changed.append("the expected appearances")
             if train.get("poses") not in (None, pose_settings(recorded.manifest)):
                 changed.append("the poses")
+            changed += _options_of_the_command(train)
             if changed:
                 return Step(StepState.READY, f"{stopped}. Changed since: {_listed(changed)}; so it begins anew.")
             return Step(StepState.READY, f"{stopped}; Continue goes on from there.")
@@ -320,6 +322,17 @@ def _training(chosen: Chosen, recorded: Recorded) -> Step:
     if changed:
         return Step(StepState.STALE, f"Changed since the training: {_listed(changed)}. Train again.")
     return Step(StepState.DONE, f"Trained with preset {trained}.")
+
+
+def _options_of_the_command(train: dict) -> list[str]:
+    """What a training was told that a panel has no field for: with the usual values it is another training."""
+    preset = train.get("preset", {})
+    usual = PRESETS.get(preset.get("name"))
+    options = ["the seed"] if train.get("seed") else []
+    # A regression's steps come from the number of images.
+    if usual and usual.estimator == "dense" and preset.get("steps") not in (None, usual.steps):
+        options.append("the number of steps")
+    return options
 
 
 def _validation(chosen: Chosen, recorded: Recorded) -> Step:
