@@ -330,6 +330,9 @@ def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
     poses = [pose_from_rotation(np.eye(3), (i, 0, 80)).tolist() for i in range(3)]
     write_index([item | {"camera_from_world": pose} for item, pose in zip(index["items"], poses)])
     study._check(unasked, studied.out, replace(QUICK, method="image"), lambda *_: None)
+    # And poses that no training sees are not called seen: no other texture's appearance is at a frame's pose.
+    with pytest.raises(InputError, match="strict alone"):
+        study.run_study(unasked, studied.out, replace(QUICK, protocols=("loto",), method="image"))
 
 
 def test_all_problems_at_once_and_nothing_trained(studied, tmp_path, capsys):
