@@ -24,6 +24,7 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, ExpectedAppearancesError, InputError
 from ExpectedAppearancesLib.evaluation import study, study_folds
+from ExpectedAppearancesLib.evaluation.study_report import write_study_report
 from ExpectedAppearancesLib.evaluation.verdict import figures_of_study
 from ExpectedAppearancesLib.geometry.camera import write_camera
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
@@ -309,7 +310,13 @@ def test_number_of_textures_trains_on_exactly_that_many(tmp_path, studied, monke
         assert set(excluded) == set("abcdefg") - set(row["trained_on"]) and set(left_out) <= set(excluded)
         assert "--no-inner-texture" in words
         assert row["metrics"]["add_mm"]["mean"] == pytest.approx(expected) and row["metrics"]["frames"] == 9
-    assert "Number of textures" in (studied.out / "report.html").read_text(encoding="utf-8")
+    html = (studied.out / "report.html").read_text(encoding="utf-8")
+    assert "Number of textures" in html and "all were trained for 5 steps" in html
+    # On a busy computer time ends trainings, each at another step.
+    rows[1]["training"]["steps"] = 4
+    write_study_report(studied.out, [(folder, result)])
+    html = (studied.out / "report.html").read_text(encoding="utf-8")
+    assert "took 4 to 5 steps" in html and "all were trained" not in html
 
 
 def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
@@ -330,6 +337,9 @@ def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
     poses = [pose_from_rotation(np.eye(3), (i, 0, 80)).tolist() for i in range(3)]
     write_index([item | {"camera_from_world": pose} for item, pose in zip(index["items"], poses)])
     study._check(unasked, studied.out, replace(QUICK, method="image"), lambda *_: None)
+    # And poses that no training sees are not called seen: no other texture's appearance is at a frame's pose.
+    with pytest.raises(InputError, match="strict alone"):
+        study.run_study(unasked, studied.out, replace(QUICK, protocols=("loto",), method="image"))
 
 
 def test_all_problems_at_once_and_nothing_trained(studied, tmp_path, capsys):

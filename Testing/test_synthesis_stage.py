@@ -18,6 +18,8 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
+from ExpectedAppearancesLib.geometry.camera import Camera, write_camera
+from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.masks.stage import read_rendered, render_case
 from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 from ExpectedAppearancesLib.textures.library import list_textures, shipped_textures_folder
@@ -103,6 +105,20 @@ def test_vessels_that_the_cortex_hides_in_all_views_are_told_before_hours_of_wor
         render_case(case, lambda *_: None, poses=2)
     with pytest.raises(InputError, match="run `render`"):
         read_rendered(case)
+
+
+def test_appearances_smaller_than_the_frames_show_what_a_camera_of_their_size_sees(tmp_path):
+    """Label maps of a microscope's frames, made small a whole half pixel aside, would teach poses that are off."""
+    paths = write_inputs(tmp_path)
+    write_camera(paths["camera.json"], Camera(640, 360, 960.0, 960.0, 330.0, 170.0))
+    case = Case.create(tmp_path / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
+    render_case(case, lambda *_: None, poses=3)
+    synthesize_case(case, [texture("a")], lambda *_: None, "image", size_px=72, iterations=1)
+    _, appearances = store.read_appearances(case, "image")
+    with MaskRenderer(case.vessels, case.cortex, appearances[0].camera) as renderer:
+        for appearance in appearances:
+            seen = renderer.render(appearance.camera_from_world)
+            assert (files.read_label_map(appearance.labels_path) != seen).mean() < 0.005
 
 
 def test_paper_preset_makes_every_pose_with_every_texture(case):

@@ -33,6 +33,8 @@ from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
 from ExpectedAppearancesLib.model.networks import build_network
 from ExpectedAppearancesLib.model.presets import PRESETS
 from ExpectedAppearancesLib.model.training import train_case
+from ExpectedAppearancesLib.poses import sampling
+from ExpectedAppearancesLib.poses.sampling import PoseSampler
 from ExpectedAppearancesLib.registration.decoding import cell_pixels
 from ExpectedAppearancesLib.registration.predictor import Predictor
 from ExpectedAppearancesLib.runs.environment import library_environment
@@ -150,6 +152,25 @@ def test_views_depend_only_on_seed_and_index_and_have_poses_of_their_own(case):
     paper = views.ViewSource(case.folder, settings("image", fresh_poses=False))
     stored = [frame["camera_from_world"] for frame in read_rendered(case)]
     assert all(min(np.abs(paper.view(i).camera_from_world - p).max() for p in stored) < 1e-12 for i in range(5))
+
+
+def test_a_view_for_which_no_pose_is_found_does_not_end_a_training(case, monkeypatch):
+    """Where the vessels are mostly wider than the view, all of a hundred poses are found, and not of thousands."""
+    source = views.ViewSource(case.folder, settings("surface"))
+    ranges = replace(source._sampler.ranges, in_view_min=0.95)
+    args = (source._sampler.craniotomy, ranges, case.camera, case.vessels.vertices_mm, 5)
+    source._sampler = PoseSampler(*args)
+    monkeypatch.setattr(sampling, "MAX_TRIES", 1)
+
+    def found(index: int) -> bool:
+        with contextlib.suppress(InputError):
+            return source._sampler.sample(index) is not None
+        return False
+
+    none_for = next(i for i in range(1, 200) if found(i - 1) and not found(i))
+    np.testing.assert_array_equal(source.view(none_for).camera_from_world, source._sampler.sample(none_for - 1))
+    assert (source.view(none_for).image != source.view(none_for - 1).image).any()
+    source.close()
 
 
 def test_processes_that_draw_in_turn_draw_what_one_draws(case):

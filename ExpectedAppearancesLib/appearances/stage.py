@@ -142,7 +142,8 @@ def _plan_images(case: Case, textures: list[Texture], size_px: int, every_textur
         if labels.shape != (camera.height, camera.width):
             import cv2
 
-            labels = cv2.resize(labels, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+            # The exact one: the other takes a pixel's upper left corner for its centre, half a pixel beside the pose.
+            labels = cv2.resize(labels, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
         files.write_png(folder / f"{i:05d}.labels.png", labels)
         for t in range(len(textures)) if every_texture else [i % len(textures)]:
             planned.append(

@@ -40,7 +40,7 @@ def add_parser(subparsers) -> None:
     parser.add_argument(
         "--textures-study",
         action="store_true",
-        help="also: 3 to 12 training textures, 3 others left out, equal steps",
+        help="also: 3 to 12 training textures, 3 others left out, equal steps where --minutes allows",
     )
     parser.add_argument("--robustness", action="store_true", help="also: error and refusals of disturbed frames")
     parser.add_argument("--robustness-frames", type=int, default=80, metavar="N", help="frames to disturb")

@@ -27,7 +27,7 @@ from .evaluate import Evaluation, check_frame, check_out, compare, known_frames,
 from .metrics import add_auc, nearest_other_pose_add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
-from .study_frames import FRAMES_PER_TEXTURE, check_unseen_poses, drawn_frames
+from .study_frames import FRAMES_PER_TEXTURE, check_poses, drawn_frames
 from .verdict import STUDY_FORMAT
 
 FORMAT_VERSION = 1
@@ -164,8 +164,8 @@ def _drawn(folder: Path, settings: StudySettings, progress: ProgressFunction) ->
         progress(0.0, text)
 
     case = Case.open(folder)
-    if "strict" in settings.protocols or settings.textures_study:
-        check_unseen_poses(case, settings.method)
+    protocols = settings.protocols
+    check_poses(case, settings.method, "strict" in protocols or settings.textures_study, "loto" in protocols)
     return drawn_frames(case, settings.method, settings.frames, settings.seed, report)
 
 

@@ -66,16 +66,23 @@ def drawn_frames(
     return path
 
 
-def check_unseen_poses(case: Case, method: str | None) -> None:
-    """Raise InputError where frames that are drawn of one texture would be at poses that models are trained on, which
-    the others' appearances have: of method `image` where each pose is made with every texture, as in the paper."""
+def check_poses(case: Case, method: str | None, unseen: bool, seen: bool) -> None:
+    """Raise InputError where frames that are drawn of one texture cannot be at poses that models of the others have
+    not seen, or at poses that they have seen. With method `image` each pose is made with every texture (the paper),
+    or with one; with `surface` poses are drawn as they are wanted."""
     method, appearances = read_appearances(case, method)
-    poses = {appearance.camera_from_world.tobytes() for appearance in appearances}
-    if method == "image" and len(poses) < len(appearances):
+    is_shared = len({appearance.camera_from_world.tobytes() for appearance in appearances}) < len(appearances)
+    if method == "image" and is_shared and unseen:
         raise InputError(
             f"{case.folder}: its appearances show the same poses in several textures, so no frame at a pose that is "
             "unseen can be drawn of them; study the protocol loto alone, give frames with --poses, or synthesise with "
             "the method surface."
+        )
+    if method == "image" and not is_shared and seen:
+        raise InputError(
+            f"{case.folder}: its appearances show each pose in one texture, so a model without that texture cannot "
+            "have seen the pose of a frame of it; study the protocol strict alone, or synthesise with the method "
+            "surface."
         )
 
 

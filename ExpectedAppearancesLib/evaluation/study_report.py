@@ -56,8 +56,7 @@ these figures; rows "accepted only" leave them out.</p>{% endif %}
 {% for name, rows in per_style %}<details><summary>{{ name }}</summary>{{ figures(rows, "left-out texture") }}</details>
 {% endfor %}
 {% if counts %}<h2>Number of textures</h2>
-<p>{{ left_out_text }} The number of training steps is the same for every model, and so is the number of training
-views.</p><img src="{{ counts }}" alt="Error against the number of training textures">
+<p>{{ left_out_text }}</p><img src="{{ counts }}" alt="Error against the number of training textures">
 {{ figures(count_rows, "training textures") }}{% endif %}
 {% for name, table in robustness %}<h2>Robustness: {{ name }}</h2>
 <p>{{ table.frames }} frames disturbed before they are registered, one way at a time, by {{ table.model }}. Occlusion is
@@ -217,4 +216,9 @@ def _baselines(name: str, study: dict) -> list[tuple[str, str, str]]:
 
 def _left_out_text(name: str, study: dict, several: bool) -> str:
     start = f"{name}: tested" if several else "Tested"
-    return f"{start} on frames of {', '.join(study['left_out'])}, which no model ({study['preset']}) was trained on."
+    text = f"{start} on frames of {', '.join(study['left_out'])}, which no model ({study['preset']}) was trained on"
+    # Time may end a training before its steps do.
+    steps = [row["training"]["steps"] for row in study["rows"]]
+    if min(steps) == max(steps):
+        return f"{text}; all were trained for {steps[0]} steps."
+    return f"{text}. Trainings took {min(steps)} to {max(steps)} steps, so models differ in more than their textures."

@@ -17,6 +17,7 @@ from ..augmentation import elastic, microscope
 from ..augmentation.impostors import impostor
 from ..augmentation.surroundings import continue_tissue, fill_outside, opening
 from ..case.case import Case
+from ..errors import InputError
 from ..geometry.pose import pose_from_rotation, rotation_matrix
 from ..masks.labels import BACKGROUND, VESSELS
 from ..masks.renderer import MaskRenderer
@@ -102,7 +103,7 @@ class ViewSource:
         rng = np.random.default_rng([self.settings.seed, 7, index])
         if self._painter:
             seen = self._poses
-            pose = self._sampler.sample(index) if seen is None else seen[rng.integers(len(seen))]
+            pose = self._fresh_pose(index) if seen is None else seen[rng.integers(len(seen))]
             labels, depth_mm, points = self._renderer.render_surface(pose)
             image = self._painter.paint(labels, depth_mm, self._painter.overview_px(points), pose, rng)
             cortex = self._painter.cortex(rng)
@@ -126,6 +127,17 @@ class ViewSource:
 
     def close(self) -> None:
         self._renderer.close()
+
+    def _fresh_pose(self, index: int) -> np.ndarray:
+        """A pose of the view's own; of a view before it where the ranges leave so little room that none is found: of
+        the thousands of a training one would end it, although all that `render` drew were found."""
+        while True:
+            try:
+                return self._sampler.sample(index)
+            except InputError:
+                if index == 0:
+                    raise
+            index -= 1
 
     def _camera_turn(self, camera_from_world: np.ndarray, rng) -> np.ndarray:
         """A rotation of the camera about its own centre: it changes the image by a homography, exactly."""
