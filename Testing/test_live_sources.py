@@ -136,6 +136,44 @@ def test_an_image_that_is_taken_away_before_its_turn_does_not_hold_up_the_others
     assert source.read().name == "3.png"
 
 
+@pytest.mark.parametrize("why", ["pause", "deleted", "lost"])
+def test_what_was_found_in_a_folder_before_a_pause_is_not_the_present(tmp_path, why):
+    """Steps through a folder that is being filled showed every second time a picture of the step before, as new; where
+    its maker had deleted that, or the drive was away, all that had come since were shown one by one."""
+    folder, now = tmp_path / "frames", [0.0]
+    folder.mkdir()
+    source = sources.ImageFiles(folder, rate_hz=25, only_new=True, clock=lambda: now[0])
+    source.open()
+    assert source.read() is None
+    write_images(folder, [f"{i}.png" for i in range(1, 5)])
+    now[0] += 1
+    assert source.read().name == "3.png"
+    now[0] += 60
+    if why == "lost":
+        folder = folder.rename(tmp_path / "away")
+        with pytest.raises(sources.SourceLost):
+            read_all_of(source, now)
+        source.close()
+        folder = folder.rename(tmp_path / "frames")
+    elif why == "deleted":
+        (folder / "4.png").unlink()
+    write_images(folder, [f"{i}.png" for i in range(5, 20)])
+    if why == "lost":
+        source.open()
+    elif why == "pause":
+        source.go_on()
+    assert read_all_of(source, now) == ["18.png", "19.png"]
+
+
+def read_all_of(source, now) -> list:
+    names = []
+    for _step in range(20):
+        now[0] += 0.1
+        frame = source.read()
+        names += [frame.name] if frame is not None else []
+    return names
+
+
 def test_a_file_that_never_gets_whole_is_said_and_left_out(tmp_path):
     write_images(tmp_path, ["b.png"])
     (tmp_path / "a.png").write_bytes((tmp_path / "b.png").read_bytes()[:200])

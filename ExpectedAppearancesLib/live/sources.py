@@ -77,7 +77,7 @@ class ImageFiles:
         self._number = 0
         self._seen: set[str] | None = None
         self._next: list[Path] = []  # found and not shown yet, the last one first
-        self._were_there = True  # those of the next look: then all are shown
+        self._were_there = self._next_were_there = True  # those of the next look: then all are shown
         self._unfinished: dict[Path, tuple[tuple, float]] = {}
 
     def open(self) -> None:
@@ -109,7 +109,7 @@ class ImageFiles:
             if os.path.exists(path):
                 self._next.append(path)  # in order: those after it wait
             else:
-                self._next, self._were_there = [], True
+                self._next, self._were_there = [], self._next_were_there
         elif self._repeat:
             self._seen, self._were_there = set(self._left_out), True
         elif not self._folder:
@@ -119,12 +119,19 @@ class ImageFiles:
 
     def go_on(self) -> None:
         self._due_s = self._clock()
+        self._forget_found()
 
     def close(self) -> None:
         self._unfinished = {}
+        self._forget_found()
+
+    def _forget_found(self) -> None:
+        """What came before a pause is not the present after it."""
+        if not self._next_were_there:
+            self._next = []
 
     def _found(self) -> list[Path]:
-        found = self._unseen()
+        found, self._next_were_there = self._unseen(), self._were_there
         late = [] if self._were_there else found[:-2]  # the last may still be written
         self._seen.update(map(str, late))
         self.dropped += len(late)
