@@ -19,9 +19,11 @@ slicer = pytest.importorskip("slicer")
 
 from live_cases import SMALL, camera_to_ras_of, choice_of, node_with, record, send, shown_pixels, wait_for  # noqa: E402
 from mrml_views import new_application  # noqa: E402
+from vtkmodules.vtkCommonMath import vtkMatrix4x4  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import live_record  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
+from ExpectedAppearancesLib.mrml.scene import camera_from_pixel  # noqa: E402
 
 
 @pytest.fixture
@@ -119,6 +121,34 @@ def test_another_recording_that_plays_gets_no_overlay_of_the_one_that_is_looked_
     logic.sequences.UpdateProxyNodesFromSequences(first)
     controller.replay(first)
     assert first.GetPlaybackActive()
+    controller.close()
+
+
+def test_a_recording_that_is_moved_in_mid_stream_leaves_nothing_of_its_own(application, phantom, model, frames):
+    """Slicer's toolbar plays into the live nodes: pixels were put back, but neither where the picture lies, for this
+    frame and all that followed, nor the pose of one that was refused."""
+    scene, logic = application
+    controller = LiveController(scene)
+    browser, _predicted = record(controller, scene, phantom, model, frames[1][:2])
+    stream = scene.GetFirstNodeByName("Stream")
+    large = np.kron(frames[1][4], np.ones((2, 2, 1), np.uint8))
+    send(stream, large)
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    for image, following in ((large.copy(), True), (covered_frame(1, SMALL.resized(640, 480)), False)):
+        send(stream, image)
+        assert wait_for(controller, lambda s: s.new).verdict.shows_overlay == following
+        pose = camera_to_ras_of(controller.live.transform)
+        browser.SetSelectedItemNumber(1 - browser.GetSelectedItemNumber())
+        logic.sequences.UpdateProxyNodesFromSequences(browser)
+        controller.tick()
+        np.testing.assert_array_equal(shown_pixels(controller.live), image)
+        np.testing.assert_allclose(camera_to_ras_of(controller.live.transform), pose, atol=1e-9)
+        placed = vtkMatrix4x4()
+        controller.live.frame.GetIJKToRASMatrix(placed)
+        placed = np.array([[placed.GetElement(i, j) for j in range(4)] for i in range(4)])
+        expected = camera_from_pixel(controller.live.camera, controller.live.plane_mm)
+        np.testing.assert_allclose(placed, expected, atol=1e-9)
     controller.close()
 
 

@@ -413,7 +413,8 @@ class LiveController:
             changed = self.live.show(update.new)
         elif update.shown is not None and not self.live.intact:
             live_record.pause_playback(self._scene)
-            changed = self.live.show(update.shown)
+            self.live.show_again(update.shown)
+            self._follow(False)
         visible = update.verdict.shows_overlay
         self.live.set_overlay_visible(visible)
         if update.new is not None or visible != self._was_visible():

@@ -90,6 +90,13 @@ class LiveScene:
         self._stamp = self._newest_change()
         return changed
 
+    def show_again(self, result: LiveResult) -> None:
+        """Put the frame and the pose that are shown back where a recording has played into their nodes."""
+        if result.image_rgb is not None:
+            self._set_pixels(result.image_rgb, changed=True)
+            scenes.set_pose(self.transform, self.camera_to_ras)
+            self._stamp = self._newest_change()
+
     @property
     def is_whole(self) -> bool:
         """Whether the user removed none of the nodes."""
