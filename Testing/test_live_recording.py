@@ -18,11 +18,12 @@ from ExpectedAppearancesLib.registration.predictor import Prediction
 slicer = pytest.importorskip("slicer")
 
 from live_cases import SMALL, camera_to_ras_of, choice_of, node_with, record, send, shown_pixels, wait_for  # noqa: E402
-from mrml_views import new_application  # noqa: E402
+from mrml_views import SliceView, new_application  # noqa: E402
 from vtkmodules.vtkCommonMath import vtkMatrix4x4  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import live_record  # noqa: E402
 from ExpectedAppearancesLib.mrml.live_controller import LiveController  # noqa: E402
+from ExpectedAppearancesLib.mrml.live_views import LiveViews  # noqa: E402
 from ExpectedAppearancesLib.mrml.scene import camera_from_pixel  # noqa: E402
 
 
@@ -150,6 +151,24 @@ def test_a_recording_that_is_moved_in_mid_stream_leaves_nothing_of_its_own(appli
         expected = camera_from_pixel(controller.live.camera, controller.live.plane_mm)
         np.testing.assert_allclose(placed, expected, atol=1e-9)
     controller.close()
+
+
+def test_a_session_starts_in_a_scene_whose_recording_cannot_be_shown_yet(application, phantom, model, frames):
+    """As one from another computer, whose case is elsewhere there: views were laid out for a frame without a camera."""
+    scene, logic = application
+    controller = LiveController(scene)
+    record(controller, scene, phantom, model, frames[1][:1])
+    controller.forget_scene()
+    view = SliceView(scene, logic, "Microscope", (160, 120))
+    again = LiveController(scene, LiveViews(view.logic, lambda: None))
+    for _stopped_before_the_first_frame in range(2):
+        again.start(choice_of(phantom, stale_s=60), model=model)
+        wait_for(again, lambda _s: not again.loading)
+        again.fit_views()
+        again.stop()
+    again.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(again, lambda s: s.new)
+    again.close()
 
 
 def test_a_loaded_scene_shows_its_last_frame_without_overlay(application, phantom, model, frames):

@@ -449,7 +449,8 @@ class LiveController:
         self._follow(changed)
 
     def _follow(self, changed: bool) -> None:
-        if self.views is not None and self.live is not None and self.live.frame is not None:
+        # A frame that a recording left has no camera before its own or another frame is shown.
+        if self.views is not None and self.live is not None and self.live.frame is not None and self.live.camera:
             self._seen_from = self.live.camera_to_world
             self.views.follow(self.live, changed)
 
