@@ -17,7 +17,7 @@ from ExpectedAppearancesLib.registration.predictor import Prediction
 slicer = pytest.importorskip("slicer")
 
 import vtk  # noqa: E402
-from live_cases import choice_of, node_with, record, wait_for  # noqa: E402
+from live_cases import choice_of, node_with, record, send, wait_for  # noqa: E402
 from mrml_views import SliceView, ThreeDView, new_application  # noqa: E402
 from vtk.util.numpy_support import vtk_to_numpy  # noqa: E402
 
@@ -223,6 +223,38 @@ def test_views_follow_when_the_user_moves_the_models_under_a_frame_that_is_held(
     truth = controller.truth
     move_and_look(controller.tick)
     assert controller.truth is truth and controller.live.lines["truth"].GetDisplayNode().GetVisibility()
+    controller.close()
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_no_overlay_where_the_vessels_in_the_scene_were_changed(application, phantom, model, frames, held):
+    """Hardened, a transform moves the vessels for good, and no camera followed: through it they lay elsewhere than in
+    the picture behind them, as green as before."""
+    scene, _logic = application
+    controller = LiveController(scene)
+    stream = node_with(scene, frames[1][0])
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, frames[1][1])
+    assert wait_for(controller, lambda s: s.new).verdict.shows_overlay
+    if held:
+        controller.freeze()
+    moved = scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Patient moved")
+    matrix = vtk.vtkMatrix4x4()
+    matrix.SetElement(0, 3, 30)
+    moved.SetMatrixTransformToParent(matrix)
+    vessels = controller.live.models["Vessels"]
+    vessels.SetAndObserveTransformNodeID(moved.GetID())
+    assert controller.tick().verdict.shows_overlay
+    vessels.HardenTransform()
+    send(stream, frames[1][2])
+    status = controller.tick() if held else wait_for(controller, lambda s: s.new)
+    assert not status.verdict.shows_overlay and not controller.live.overlay_visible
+    assert "hardened" in status.verdict.detail
+    controller.start(choice_of(phantom, stale_s=60), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, frames[1][3])
+    assert wait_for(controller, lambda s: s.new).verdict.shows_overlay
     controller.close()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -221,6 +222,9 @@ class LiveController:
         if self._stream is not None:
             self._session.say_source(self._stream.look())
         update = self._session.tick(wait_s)
+        if not self.live.vessels_are_the_cases:
+            changed = "The vessels in the scene were changed: edited, or a transform of theirs was hardened"
+            update = replace(update, verdict=Verdict(Sight.FAILED, update.verdict.age_s, changed))
         begin = time.perf_counter()
         self._show(update)
         if update.new is not None:

@@ -59,6 +59,7 @@ class LiveScene:
         self.models = scenes.add_case_models(scene, case)
         for name, node in self.models.items():
             mark(node, name)
+        self._vessel_points = self._points_of_vessels()
         self.transform = node_of_role(scene, TRANSFORM)
         if self.transform is None:
             self.transform = mark(scenes.add_camera_transform(scene, self.camera_to_ras), TRANSFORM)
@@ -99,10 +100,20 @@ class LiveScene:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the user removed none of the nodes."""
+        """Whether the user removed none of the nodes, and left the vessels as they were."""
         nodes = (self.transform, self.frame, self.frustum, self.fill, self.backdrop)
         nodes += (*self.models.values(), *self.lines.values())
-        return all(self._scene.IsNodePresent(node) for node in nodes if node is not None)
+        return self.vessels_are_the_cases and all(self._scene.IsNodePresent(n) for n in nodes if n is not None)
+
+    @property
+    def vessels_are_the_cases(self) -> bool:
+        """False once the user hardened a transform of theirs, or edited them: no camera would follow that."""
+        return self._points_of_vessels() == self._vessel_points
+
+    def _points_of_vessels(self) -> tuple | None:
+        data = self.models[scenes.VESSELS].GetPolyData()
+        points = data.GetPoints() if data is not None else None
+        return None if points is None else (points, points.GetMTime())
 
     @property
     def camera_to_world(self) -> np.ndarray:
