@@ -155,3 +155,27 @@ while events:
 assert drawn[5:] == [plane, through] and not plane.paused and not through.paused and not hidden.paused
 """
     )
+
+
+def test_nothing_of_a_recording_is_shown_once_the_module_is_left():
+    """The end of the session that it was made in brings it back, and after that nobody would take it away."""
+    in_the_live_panel(
+        """
+shown = []
+controller.running, controller.recorder = True, None
+def stop():
+    controller.running = False
+    shown.clear()
+controller.stop = stop
+controller.look_at = lambda browser, _case: shown.append(browser) or controller.status
+slicer.mrmlScene = MagicMock()
+slicer.mrmlScene.IsBatchProcessing.return_value = False
+browser = panel.parameters().browser = MagicMock()
+browser.GetNumberOfItems.return_value = 2
+panel._camera, panel.status, panel.layout, panel.align = controller.camera, MagicMock(), MagicMock(), MagicMock()
+panel.stop()
+assert shown == [browser]
+panel.leave()
+assert shown == []
+"""
+    )
