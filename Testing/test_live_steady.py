@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -181,3 +182,13 @@ def test_recorded_frames_keep_both_poses_and_replay_the_one_that_was_drawn(case,
         assert entry.extra["tracking"]["used"] == (result.overlay is not None)
         if result.overlay is not None:
             np.testing.assert_array_equal(entry.extra["tracked_camera_from_world"], result.camera_from_world)
+
+
+def test_python_does_not_look_through_all_its_objects_while_a_session_runs(case):
+    """In 3D Slicer that takes 50 ms, at any time, on the GUI's thread as well."""
+    session = LiveSession(case, Scripted([]), CAMERA)
+    known = gc.get_freeze_count()
+    session.start()
+    assert gc.get_freeze_count() > known + 1000
+    assert session.stop()
+    assert gc.get_freeze_count() == 0

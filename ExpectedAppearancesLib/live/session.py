@@ -6,6 +6,7 @@ in the session's two threads. A frame, its pose and its overlay travel as one ob
 
 from __future__ import annotations
 
+import gc
 import math
 import time
 from collections.abc import Callable
@@ -128,6 +129,9 @@ class LiveSession:
     def start(self, source: Source | None = None, single: bool = False) -> None:
         """Begin with a source, or without one when frames are pushed. single: freeze at the first frame."""
         self._running, self._single, self._frozen = True, single, False
+        # Now and then Python looks through all objects for some that can go: 50 ms in 3D Slicer, on whatever thread.
+        # Those that are there already need no look meanwhile.
+        gc.freeze()
         if source is not None:
             self._feed = Feed(source, self.push)
             self._feed.start()
@@ -187,6 +191,7 @@ class LiveSession:
     def stop(self) -> bool:
         """End both threads; nothing is shown any more. False when a driver hangs (its thread then ends by itself)."""
         self._running = self._frozen = False
+        gc.unfreeze()
         ended = self._feed.stop() if self._feed else True
         self._feed, self._shown = None, None
         return self._worker.stop() and ended
