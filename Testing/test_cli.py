@@ -309,7 +309,7 @@ def test_check_reports_this_machine(monkeypatch, capsys):
 
 def test_check_survives_broken_graphics_and_missing_packages(monkeypatch, capsys):
     def version(name):
-        if name in ("onnxruntime", "onnxruntime-gpu", "torch", "slicer-core"):
+        if name in ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "torch", "slicer-core"):
             raise check.metadata.PackageNotFoundError(name)
         return "1.0"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -192,3 +193,20 @@ def test_python_does_not_look_through_all_its_objects_while_a_session_runs(case)
     assert gc.get_freeze_count() > known + 1000
     assert session.stop()
     assert gc.get_freeze_count() == 0
+
+
+@pytest.mark.parametrize("go_on", [LiveSession.resume, LiveSession.next_frame])
+def test_a_frame_that_came_as_another_was_held_is_not_shown_after_the_pause(case, go_on):
+    image = np.zeros((240, 320, 3), np.uint8)
+    session = LiveSession(case, Scripted([REFUSED] * 3), CAMERA, clock=lambda: 0.0)
+    session.start()
+    session.push(LiveFrame(image, 0.0, 0))
+    assert session.tick(30.0).new.frame.number == 0
+    session.freeze()
+    session._worker.submit(LiveFrame(image, 0.0, 1))  # its push had looked just before
+    while session._worker.counts.done < 2:
+        time.sleep(0.002)
+    go_on(session)
+    session.push(LiveFrame(image, 0.0, 2))
+    assert session.tick(30.0).new.frame.number == 2
+    assert session.stop()

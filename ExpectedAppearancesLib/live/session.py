@@ -155,12 +155,14 @@ class LiveSession:
             self._worker.forget()
 
     def resume(self) -> None:
+        self._worker.forget()  # a frame that came just as the one before was held: it is old by now
         self._frozen = self._single = False
         self._hold_source(False)
 
     def next_frame(self) -> None:
         """Register one more frame, then hold again; of files and videos it is the very next one, unless they came
         only now."""
+        self._worker.forget()
         self._frozen, self._single = False, True
         self._hold_source(False)
 
