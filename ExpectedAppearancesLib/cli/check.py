@@ -13,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 
 from .. import __version__
+from ..runs.dependencies import ONNXRUNTIME, OPENCV
 from ..runs.environment import python_for_runs
 
 DESCRIPTION = """\
@@ -24,11 +25,8 @@ Exit code 0 when everything needed is there, 1 otherwise."""
 PACKAGES = (
     (("numpy",), "every command"),
     (("vtk", "slicer-core"), "every command"),
-    (
-        ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
-        "every command",
-    ),
-    (("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml"), "register"),
+    (OPENCV.distributions, "every command"),
+    (ONNXRUNTIME.distributions, "register"),
     (("torch",), "synthesize and train"),
     (("safetensors",), "synthesize and train"),
     (("onnx",), "train"),

@@ -38,14 +38,19 @@ class Package:
     def name(self) -> str:
         return self.specifier.partition(">=")[0]
 
+    @property
+    def distributions(self) -> tuple[str, ...]:
+        """Any one of them will do."""
+        return (self.name, *self.others)
+
 
 _NUMPY = Package("numpy>=1.26", "numpy")
-_OPENCV = Package(
+OPENCV = Package(
     "opencv-python-headless>=4.8",
     "cv2",
     ("opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
 )
-_ONNXRUNTIME = Package("onnxruntime>=1.17", "onnxruntime", ("onnxruntime-gpu", "onnxruntime-directml"))
+ONNXRUNTIME = Package("onnxruntime>=1.17", "onnxruntime", ("onnxruntime-gpu", "onnxruntime-directml"))
 _SCIPY = Package("scipy>=1.11", "scipy")
 _PSUTIL = Package("psutil>=5.9", "psutil")
 _FILELOCK = Package("filelock>=3.12", "filelock")
@@ -53,12 +58,12 @@ _TORCH = Package("torch>=2.4", "torch")
 
 # By purpose. Registration, in the operating room, needs neither torch nor what trains.
 REQUIREMENTS: dict[str, tuple[Package, ...]] = {
-    "registration": (_NUMPY, _OPENCV, _ONNXRUNTIME),
-    "planning": (_NUMPY, _OPENCV, Package("scikit-image>=0.22", "skimage"), _PSUTIL, _FILELOCK),
+    "registration": (_NUMPY, OPENCV, ONNXRUNTIME),
+    "planning": (_NUMPY, OPENCV, Package("scikit-image>=0.22", "skimage"), _PSUTIL, _FILELOCK),
     "training": (
         _NUMPY,
-        _OPENCV,
-        _ONNXRUNTIME,
+        OPENCV,
+        ONNXRUNTIME,
         _TORCH,
         Package("safetensors>=0.4", "safetensors"),
         Package("onnx>=1.15", "onnx"),
@@ -137,7 +142,7 @@ def _is_met(package: Package) -> bool:
             return False
     except (ImportError, ValueError):
         return False
-    for name in (package.name, *package.others):
+    for name in package.distributions:
         try:
             return _is_new_enough(package.specifier, metadata.version(name))
         except metadata.PackageNotFoundError:
