@@ -50,6 +50,11 @@ panel.install()
 assert len(begun) == 1
 panel.install()
 assert len(begun) == 2
+
+from ExpectedAppearancesLib.runs import dependencies
+with dependencies.installing():  # the planning panel does
+    panel.install()
+assert len(begun) == 2 and not dependencies.is_installing()
 """
     )
 

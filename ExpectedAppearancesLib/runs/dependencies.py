@@ -84,6 +84,25 @@ class InstallError(ExpectedAppearancesError):
         self.log = log
 
 
+_installing = False
+
+
+def is_installing() -> bool:
+    """Whether a block of `installing` goes on, whoever began it."""
+    return _installing
+
+
+@contextlib.contextmanager
+def installing() -> Iterator[None]:
+    """Around asking and installing: Slicer answers to clicks while pip is at work, and must not start it once more."""
+    global _installing
+    _installing = True
+    try:
+        yield
+    finally:
+        _installing = False
+
+
 def missing(kind: str) -> list[str]:
     """pip's requirements for "registration", "planning" or "training" that are not met here. Imports none of them."""
     importlib.invalidate_caches()

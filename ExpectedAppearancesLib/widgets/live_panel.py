@@ -15,6 +15,7 @@ from ..live.trust import Controls, controls
 from ..mrml.live_controller import LiveController
 from ..mrml.live_scene import OverlayOptions
 from ..mrml.mri import scan_to_show
+from ..runs import dependencies
 from . import live_install
 from .drawing import DrawnInTurn
 from .labels import set_text
@@ -44,7 +45,6 @@ class LivePanel:
         self._problem = ""
         self._starting = False
         self._missing = live_install.problem()
-        self._installing = False
         self._ticks = 0
         self._fit_due = False
         self._buttons: tuple | None = None
@@ -214,13 +214,10 @@ class LivePanel:
             self.start(single=True)
 
     def install(self) -> None:
-        if self._installing:  # Slicer answers to clicks while pip is at work
+        if dependencies.is_installing():
             return
-        self._installing = True
-        try:
+        with dependencies.installing():
             live_install.install(self.say)
-        finally:
-            self._installing = False
         self.refresh()
 
     def tick_now(self) -> None:

@@ -25,7 +25,6 @@ class HelpSection:
         self._timer.setInterval(200)
         self._timer.connect("timeout()", self._look)
         self._missing: dict[str, list[str]] | None = None
-        self._installing = False
         self.ui.installButton.connect("clicked(bool)", lambda _checked=False: self.on_install())
         self.ui.installFolderButton.connect("clicked(bool)", lambda _checked=False: self.on_install_from_folder())
         self.ui.systemCheckButton.connect("clicked(bool)", lambda _checked=False: self.on_check())
@@ -40,7 +39,7 @@ class HelpSection:
         reason = "" if names else _("Nothing is missing.")
         if names and self.panel.running():  # what it has loaded must not be replaced beneath it
             reason = _("A run is going on, which uses these packages; wait until it is ready, or cancel it.")
-        if self._installing:
+        if dependencies.is_installing():
             reason = _("The packages are being installed.")
         allow(self.ui.installButton, reason, _("Download and install them; you are asked first."))
         allow(self.ui.installFolderButton, reason, _("Install them from a folder of wheels, without a network."))
@@ -67,21 +66,21 @@ class HelpSection:
         self._checking = None
 
     def on_install(self, wheels_folder: Path | None = None) -> None:
-        if self._installing:  # Slicer answers to clicks while pip is at work
+        if dependencies.is_installing():
             return
 
         def confirm(names: list[str]) -> bool:
             text = _("These Python packages will be installed into this Slicer:") + "\n\n" + "\n".join(names)
             return slicer.util.confirmOkCancelDisplay(text, windowTitle=_("Install Python packages"))
 
-        self._installing = True
+        said = _("The packages could not be installed.")
         try:
-            with slicer.util.tryWithErrorDisplay(_("The packages could not be installed."), waitCursor=True):
+            with dependencies.installing(), slicer.util.tryWithErrorDisplay(said, waitCursor=True):
                 for kind in KINDS:
                     if not dependencies.install(kind, wheels_folder, confirm):
                         break  # declined: not asked for more
         finally:  # what is displayed as an error ends this, too
-            self._installing, self._missing = False, None
+            self._missing = None
             self.panel.refresh_soon()
 
     def on_install_from_folder(self) -> None:
