@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 
 import cases
 import pytest
+
+
+def pytest_sessionstart():
+    """A shell without job control starts what it puts in the background with Ctrl+C ignored, and its children too."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -361,11 +361,14 @@ def test_a_cancelled_training_loses_no_step(case, tmp_path, number):
             [sys.executable, str(tmp_path / "stepper.py"), str(case.folder), str(tmp_path / "steps.txt")],
             env=library_environment(),
         )
-        deadline = time.monotonic() + 300
-        while len(steps()) < wanted and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.send_signal(number)
-        assert process.wait(120) == 3
+        try:
+            deadline = time.monotonic() + 300
+            while len(steps()) < wanted and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.02)
+            process.send_signal(number)
+            assert process.wait(120) == 3
+        finally:
+            process.kill()
         assert len(steps()) >= wanted and training_state(path)["step"] == steps()[-1]
     assert steps() == list(range(1, len(steps()) + 1))  # none again, none left out
 
