@@ -26,7 +26,7 @@ from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.geometry.pose import transform
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.masks.stage import craniotomy_of, parenchyma_of, read_rendered, render_case
-from ExpectedAppearancesLib.model import checkpoint, views
+from ExpectedAppearancesLib.model import checkpoint, training, views
 from ExpectedAppearancesLib.model.encoding import fit_encoding, network_camera
 from ExpectedAppearancesLib.model.feeder import Feeder, draw_views
 from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
@@ -130,8 +130,6 @@ def test_training_starts_at_the_shipped_weights_and_asks_for_them_when_it_goes_o
 def test_a_training_begins_anew_where_the_craniotomy_was_moved(case, tmp_path):
     """The appearances stay as they are where only its centre moved, since they show all of the surface: a finished
     training would count as one on the poses around the new centre."""
-    from ExpectedAppearancesLib.model import training
-
     moved = Case(case.folder, copy.deepcopy(case.manifest), case.camera)
     moved.manifest["stages"]["render"]["craniotomy"]["centre_world_mm"][0] += 8.0
     encoding = fit_encoding(np.stack([np.eye(4)] * 3), case.vessels.centroid_mm, case.vessels.radius_mm)
@@ -292,8 +290,6 @@ def test_training_is_on_record_with_seeds_styles_and_curve(trained):
 
 
 def test_a_stopped_training_goes_on_from_its_checkpoint(trained, monkeypatch):
-    from ExpectedAppearancesLib.model import training
-
     monkeypatch.setattr(training, "checkpoint_interval_s", lambda _took_s: 0.0)
     preset = replace(TINY, steps=6)
     saves = []
@@ -455,8 +451,6 @@ def test_a_checkpoint_that_does_not_fit_on_the_disk_is_told_in_words(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system gives no process a part of the cores")
 def test_processes_that_render_are_no_more_than_the_cores_that_training_was_given(monkeypatch):
     """Four of a machine's 128, say: 127 processes, each with its meshes and appearances, do not fit in their memory."""
-    from ExpectedAppearancesLib.model import training
-
     monkeypatch.setattr(os, "cpu_count", lambda: 128)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {7, 8, 9, 10})
     assert training._feeder_workers(CPU) == 1 and training._feeder_workers(torch.device("cuda")) == 2
@@ -467,3 +461,10 @@ def test_training_without_appearances_says_what_to_run(tmp_path):
     bare = Case.create(tmp_path / "case", paths["vessels.vtp"], None, paths["camera.json"])
     with pytest.raises(InputError, match="run `synthesize` first"):
         train_case(bare, TINY, lambda *_: None, CPU)
+
+
+@pytest.mark.parametrize(("cores", "physical", "threads"), [(1, 1, 1), (1, 8, 1), (2, 1, 1), (2, 2, 2), (9, 9, 6)])
+def test_both_of_two_real_cores_train(monkeypatch, cores, physical, threads):
+    monkeypatch.setattr(training, "_cores", lambda: cores)
+    monkeypatch.setattr(psutil, "cpu_count", lambda logical: physical)
+    assert training._training_threads() == threads

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -76,7 +77,7 @@ def synthesize_case(
     )
 
     def report(images: float, name: str) -> None:
-        text = f"appearance {min(int(images) + 1, len(planned))} of {len(planned)}, {name}"
+        text = f"appearance {max(1, math.ceil(round(images, 3)))} of {len(planned)}, {name}"
         progress(min(1.0, images / len(planned)), text)
 
     run_shards(shards, recipe, executor, report)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
 import torch.nn.functional as F
 
@@ -127,6 +128,13 @@ def _feeder_workers(device: torch.device) -> int:
     return max(1, cores - 2) if device.type == "cuda" else max(1, cores // 3)
 
 
+def _training_threads() -> int:
+    """On a CPU. Cores that render are left to that; of two it needs a small part only, so both train where they are
+    real ones: two threads of one core that wait for each other cost more than they give."""
+    physical = psutil.cpu_count(logical=False) or 1
+    return max(_cores() - _feeder_workers(torch.device("cpu")), min(_cores(), physical, 2))
+
+
 class _Trainer:
     """Network, optimiser, running average and schedule of one run."""
 
@@ -184,8 +192,7 @@ class _Trainer:
         begin = time.monotonic() - state["seconds"]
         saved, interval_s = time.monotonic(), checkpoint_interval_s(0.0)
         if self.device.type == "cpu":
-            # Rendering has cores of its own: threads that wait for each other on one core cost more than they give.
-            torch.set_num_threads(max(1, _cores() - _feeder_workers(self.device)))
+            torch.set_num_threads(_training_threads())
         use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
