@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from ExpectedAppearancesLib.augmentation import elastic
+from ExpectedAppearancesLib.geometry.camera import Camera
+from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation, rotation_matrix
 
 
 def best_fit_affine_motion_px(field_px):
@@ -63,3 +65,22 @@ def test_no_amplitude_no_displacement_and_nonsense_is_refused():
     for shape_hw, amplitude, smoothness in (((3, 16), 1, 8), ((16, 16), -1, 8), ((16, 16), 1, 0)):
         with pytest.raises(ValueError):
             elastic.displacement_field(shape_hw, amplitude, smoothness, np.random.default_rng(0))
+
+
+def test_nearest_pose_is_found_and_stays_where_too_little_is_seen():
+    """A tilted plane far from the origin, off-centre camera: where each cell's ray meets it is worked out by hand."""
+    camera = Camera(128, 128, 240.0, 250.0, 70.0, 58.0)
+    middle = np.array([900.0, -400.0, 300.0])
+    true = look_at(np.array([930.0, -380.0, 390.0]), middle, np.array([0, 1.0, 0]))
+    cells_px = (np.stack(np.meshgrid(np.arange(32), np.arange(32)), axis=-1) + 0.5) * 4 - 0.5
+    rays = np.concatenate([(cells_px - [70.0, 58.0]) / [240.0, 250.0], np.ones((32, 32, 1))], axis=-1) @ true[:3, :3]
+    eye = -true[:3, :3].T @ true[:3, 3]
+    points_mm = eye + rays * ((middle - eye)[2] / rays[..., 2:])
+    start = pose_from_rotation(rotation_matrix(np.array([0.02, -0.01, 0.03])), np.array([1.0, -2.0, 3.0])) @ true
+    surface = np.zeros((32, 32), np.uint8)
+    surface[4:30, 2:20] = 1
+    found = elastic.nearest_pose(start, points_mm.astype(np.float32), surface, camera)
+    np.testing.assert_allclose(found, true, atol=2e-3)
+    surface[8:] = 0
+    surface[:, 10:] = 0
+    assert elastic.nearest_pose(start, points_mm, surface, camera) is start

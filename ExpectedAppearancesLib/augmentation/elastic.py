@@ -1,7 +1,8 @@
 """Elastic deformation that imitates brain shift in the image and keeps the pose label true (paper, section 2.2).
 
 A deformation with an affine part moves, turns or scales the whole view: the label would be wrong by millimetres.
-So the affine part is removed exactly: what is left bends the image without moving it as a whole.
+So the affine part is removed exactly: what is left bends the image without moving it as a whole. The tissue in view is
+only a part of the image, which the bending does move: the label follows it (`nearest_pose`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,11 @@ import math
 
 import cv2
 import numpy as np
+
+from ..geometry.camera import Camera
+from ..geometry.pose import pose_from_rotation, rotation_matrix, rotation_vector
+
+FITTED_POINTS, LEAST_FITTED_POINTS = 250, 50
 
 
 def displacement_field(
@@ -66,6 +72,29 @@ def warp(image: np.ndarray, field_px: np.ndarray, interpolation: int = cv2.INTER
     x, y = _grid(height, width)
     source_x, source_y = x + field_px[..., 0], y + field_px[..., 1]
     return cv2.remap(image, source_x, source_y, interpolation, borderMode=cv2.BORDER_REFLECT_101)
+
+
+def nearest_pose(
+    camera_from_world: np.ndarray, points_mm: np.ndarray, surface: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """The pose (4, 4) that brings the surface of a bent view closest to where it is seen: least squares of pixels.
+
+    camera_from_world: before it was bent. points_mm (G, G, 3): the surface point, world, that each cell of a grid over
+    the camera's whole image shows, where surface (G, G) says so.
+    """
+    rows, columns = np.nonzero(surface)
+    chosen = slice(None, None, len(rows) // FITTED_POINTS + 1)
+    rows, columns = rows[chosen], columns[chosen]
+    if len(rows) < LEAST_FITTED_POINTS:
+        return camera_from_world
+    seen_px = (np.stack([columns, rows], axis=1) + 0.5) * (camera.width / surface.shape[1]) - 0.5
+    points = points_mm[rows, columns].astype(np.float64)
+    centre = points.mean(axis=0)
+    rotation = camera_from_world[:3, :3]
+    start = rotation_vector(rotation)[:, None], (rotation @ centre + camera_from_world[:3, 3])[:, None]
+    turned, moved_mm = cv2.solvePnPRefineLM(points - centre, seen_px, camera.matrix, None, *start)
+    rotation = rotation_matrix(turned.ravel())
+    return pose_from_rotation(rotation, moved_mm.ravel() - rotation @ centre)
 
 
 @functools.lru_cache(maxsize=8)

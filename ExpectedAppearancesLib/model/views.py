@@ -32,8 +32,9 @@ DRAWN_TRIANGLE_PX = 4.0  # area, seen from afar: software rendering of smaller o
 
 @dataclass(frozen=True)
 class View:
-    """image uint8 (S, S, 3); camera_from_world (4, 4); on the grid of half the size: points_mm float32 (G, G, 3), the
-    surface point seen, world mm; surface, vessels uint8 (G, G). A negative view has no surface."""
+    """image uint8 (S, S, 3); camera_from_world (4, 4), of a bent view the nearest; on the grid of half the size:
+    points_mm float32 (G, G, 3), the surface point seen, world mm; surface, vessels uint8 (G, G). A negative view has no
+    surface."""
 
     image: np.ndarray
     camera_from_world: np.ndarray
@@ -167,11 +168,13 @@ class ViewSource:
             coarse = elastic.displacement_field((64, 64), amplitude, 64 * rng.uniform(0.12, 0.3), rng)
             field = cv2.resize(coarse * np.float32(size / 64), (size, size), interpolation=cv2.INTER_LINEAR)
             small = elastic.warp(small, field)
-            # The brain moves and takes its points along: what a pixel shows stays true, the pose's mean does too.
+            # The brain moves and takes its points along: what a pixel shows stays true.
             moved = cv2.resize(coarse, cells_px.shape[1::-1], interpolation=cv2.INTER_LINEAR)
             cells_px = cells_px + moved * np.float32(len(labels) / 64)
         small = microscope.apply(small, rng)
         points, surface, vessels = _to_grid(points, labels, cells_px)
+        if self.settings.elastic_px > 0:
+            pose = elastic.nearest_pose(pose, points, surface, self.camera)
         if rng.uniform() < self.settings.negatives:
             small = impostor(small, rng)
             surface, vessels = np.zeros_like(surface), np.zeros_like(vessels)
