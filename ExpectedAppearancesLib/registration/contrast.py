@@ -180,6 +180,8 @@ class _EdgeSearch:
     def for_colours(picture: _Picture, outline: _Outline) -> _EdgeSearch | None:
         """The axis on which colours beside the outline differ most; None where too little of it lies on tissue."""
         points_px, normals = outline.seen(*turn_and_place(outline.fit), picture.camera)
+        if points_px.shape[1] < LEAST_POINTS:
+            return None
         beside = np.arange(NEAREST_PX, FARTHEST_PX + STEP_PX / 2, STEP_PX)
         where = _along(points_px, normals, np.concatenate([-beside, beside]))
         colours = cv2.remap(picture.image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

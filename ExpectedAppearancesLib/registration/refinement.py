@@ -55,6 +55,8 @@ class VesselAligner:
         field_focal = finer * focal[:, None]
         field_principal = finer * (np.array([[self._camera.cx], [self._camera.cy]]) + 0.5) - 0.5
         edges = self._silhouette.edges(fit.camera_from_world, facing_borders_only=True)
+        if not len(edges):  # seen from behind, as by a mirrored picture, vessels that are open below have no outline
+            return Alignment(fit, 0.0, REACH_PX, 0.0)
         edges = edges[:: len(edges) // POINTS + 1]
         relative = np.ascontiguousarray((self._vertices_mm[edges].mean(axis=1) - fit.centre_world_mm).T)
         descent = Descent(fit, fit, PRIOR)
