@@ -382,6 +382,21 @@ def test_a_study_of_another_preset_than_the_models_is_outdated(case):
         assert reader.recorded(folder, "surface", Limits()).validation == validation
 
 
+def test_a_study_of_the_other_methods_appearances_is_outdated(case):
+    """One image for each pose was tried, and studied, beside a model of the surface: its verdict stood for that one."""
+    reader, folder = CaseReader(), str(case.folder)
+    for method in ("surface", "image"):
+        store.write_index(case, method, case.camera, {"of": method}, [], done=True)
+    surface, image = (files.sha256(store.folder_of(case, m) / "index.json") for m in ("surface", "image"))
+    files.write_json(case.folder / "study" / "study.json", study() | {"inputs": {"appearances_sha256": image}})
+    assert reader.recorded(folder, "surface", Limits()).validation == "known"  # nothing is trained yet
+    files.write_json(case.model_folder / "model.json", {"preset": "quick"})
+    # The model is of the one, of the other, and of appearances that are not there any more, which its own step tells.
+    for of_model, validation in ((surface, "stale"), (image, "known"), ("older", "known")):
+        case.record("train", done=True, appearances_sha256=of_model)
+        assert reader.recorded(folder, "surface", Limits()).validation == validation
+
+
 def test_a_study_of_other_poses_is_outdated(case):
     """Its verdict stood for a model that was trained since on a wider range, around another place."""
     reader, folder = CaseReader(), str(case.folder)

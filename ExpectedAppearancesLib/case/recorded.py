@@ -85,7 +85,10 @@ class CaseReader:
             inputs = study.get("inputs") or {}
             used = inputs.get("appearances_sha256")
             indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
-            stale = bool(used) and used not in [index[1] for index in indices if index]
+            current = [index[1] for index in indices if index]
+            of_model = case.manifest["stages"].get("train", {}).get("appearances_sha256")
+            # Of one method's they say nothing of a model of the other's.
+            stale = bool(used) and used not in ([of_model] if model and of_model in current else current)
             # Of another craniotomy, or of a narrower range, they say nothing of the model that was trained since.
             stale = stale or drawn_from_elsewhere(inputs, case.manifest)
             presets = {content["preset"] for content in (study, model or {}) if content.get("preset")}
