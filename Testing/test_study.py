@@ -63,10 +63,11 @@ class ShiftedPredictor:
     """Answers the true pose moved along x by its style's distance; the first pixel of a frame is its number."""
 
     known: Path
+    styles = ()  # that it was trained on
 
     def __init__(self, folder, _threads=2):
         self.folder = Path(folder)
-        self.meta = {"preset": "quick"}
+        self.meta = {"preset": "quick", "styles": self.styles}
         self.frames = read_poses(self.known)[1]
 
     def predict(self, image_rgb, _camera):
@@ -157,6 +158,21 @@ def test_report_is_one_file_with_its_pictures(studied):
     assert robustness["undisturbed"]["add_mm"]["mean"] == pytest.approx(7 / 3)
     for name in ("curves.png", "textures.png"):
         assert files.read_image_rgb(studied.out / name).std() > 5
+
+
+def test_robustness_is_told_of_the_model_it_was_measured_with(studied, monkeypatch):
+    """With textures that it was trained on, and no longer once the case's model is another one."""
+    monkeypatch.setattr(study, "_write_overlays", lambda *_: None)
+    few = {"robustness": True, "robustness_frames": 1, "protocols": ()}
+    files.write_bytes(studied.case / "model" / "model.onnx", b"first")
+    assert run(studied, replace(QUICK, **few))["robustness"]["model"] == "the case's own model (quick)"
+    monkeypatch.setattr(ShiftedPredictor, "styles", ["a", "b", "z"])
+    run(studied, replace(QUICK, **few))
+    assert "robustness" in run(studied)
+    assert "(quick), which was trained on 2 of their 3 textures" in (studied.out / "report.html").read_text("utf-8")
+    files.write_bytes(studied.case / "model" / "model.onnx", b"trained again")
+    assert "robustness" not in run(studied)
+    assert "own model" not in (studied.out / "report.html").read_text("utf-8")
 
 
 def test_cases_that_are_called_alike_keep_apart_in_one_report(studied, tmp_path, monkeypatch):

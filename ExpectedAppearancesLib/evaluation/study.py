@@ -293,6 +293,9 @@ def _begin(one: StudyCase, settings: StudySettings) -> dict:
     except InputError:
         before = None
     if before and before.get("inputs") == one.inputs:
+        own = _own_model_sha256(one)
+        if before.get("robustness", {}).get("own_model_sha256", own) != own:
+            del before["robustness"]  # of the case's own model, which has been trained again since
         return before
     study = {
         "format": STUDY_FORMAT,
@@ -376,7 +379,12 @@ def _robustness(one: StudyCase, settings: StudySettings, progress: ProgressFunct
     count, seed = settings.robustness_frames, settings.seed
     table = robustness_table(vertices_mm, one.camera, frames, predictor_of, model, count, seed, progress)
     files.write_png(one.folder / "robustness.png", example_sheet(frames[0], one.camera, vertices_mm, seed))
-    return table | {"examples": "robustness.png"}
+    return table | {"examples": "robustness.png", "own_model_sha256": _own_model_sha256(one)}
+
+
+def _own_model_sha256(one: StudyCase) -> str | None:
+    path = one.case.model_folder / "model.onnx"
+    return files.sha256(path) if path.is_file() else None
 
 
 def _predictor_of(one: StudyCase, settings: StudySettings):
@@ -385,7 +393,9 @@ def _predictor_of(one: StudyCase, settings: StudySettings):
 
     if (one.case.model_folder / "model.onnx").is_file():
         own = open_predictor(one.case)
-        return (lambda _style: own), f"the case's own model ({own.meta['preset']})"
+        seen = len(set(one.styles) & set(own.meta.get("styles", ())))
+        trained_on = f", which was trained on {seen} of their {len(one.styles)} textures" if seen else ""
+        return (lambda _style: own), f"the case's own model ({own.meta['preset']}){trained_on}"
     preset, protocol = settings.presets[0], settings.protocols[0]
     folders = {style: _job(one, settings, preset, protocol, style, (style,)).folder for style in one.styles}
     predictors = {style: Predictor(folder) for style, folder in folders.items()}
