@@ -112,9 +112,9 @@ def test_disc_lies_below_all_vessels_and_reaches_beyond_them():
     assert disc.radius_mm > 1.1 * mesh.radius_mm
 
 
-def sampler(**ranges) -> PoseSampler:
+def sampler(seed: int = 3, **ranges) -> PoseSampler:
     craniotomy = Craniotomy(vessels().centroid_mm, np.array([0, 0, 1.0]), np.array([0, -1.0, 0]))
-    return PoseSampler(craniotomy, PoseRanges(**ranges), camera(), vessels().vertices_mm, seed=3)
+    return PoseSampler(craniotomy, PoseRanges(**ranges), camera(), vessels().vertices_mm, seed)
 
 
 def test_poses_keep_to_their_ranges():
@@ -165,7 +165,10 @@ def test_vessels_are_in_view():
 
 def test_all_impossible_ranges_are_reported_at_once():
     with pytest.raises(InputError) as error:
-        sampler(tilt_max_deg=120, roll_max_deg=-1, working_distance_mm=(50, 40), lateral_offset_mm=-1)
+        sampler(tilt_max_deg=120, roll_max_deg=-1, working_distance_mm=(50, 40), lateral_offset_mm=-1, in_view_min=60)
+    assert len(error.value.problems) == 5
+    with pytest.raises(InputError) as error:  # blamed on vessels and camera, or an error of numpy's
+        sampler(seed=-1, working_distance_mm=(50, np.inf), lateral_offset_mm=np.nan, in_view_min=np.nan)
     assert len(error.value.problems) == 4
 
 

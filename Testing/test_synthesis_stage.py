@@ -105,6 +105,8 @@ def test_vessels_that_the_cortex_hides_in_all_views_are_told_before_hours_of_wor
         render_case(case, lambda *_: None, poses=2)
     with pytest.raises(InputError, match="run `render`"):
         read_rendered(case)
+    with pytest.raises(InputError, match="circular field: 33"):  # percent left no circle, and 0 blamed the cortex
+        render_case(case, lambda *_: None, poses=2, circular_field=33)
 
 
 def test_appearances_smaller_than_the_frames_show_what_a_camera_of_their_size_sees(tmp_path):

@@ -71,6 +71,8 @@ def render_case(
     """Sample `poses` poses and write their label maps; goes on where an interrupted run of the settings stopped."""
     if poses < 1:
         raise InputError(f"poses: {poses}; give at least 1.")
+    if circular_field is not None and not 0 < circular_field <= 1:
+        raise InputError(f"circular field: {circular_field}; give its radius as a share of the image's height, 0 to 1.")
     craniotomy = craniotomy or find_craniotomy(case.vessels, case.cortex, case.space)
     sampler = PoseSampler(craniotomy, ranges or PoseRanges(), case.camera, case.vessels.vertices_mm, seed)
     matrices = [sampler.sample(i) for i in range(poses)]

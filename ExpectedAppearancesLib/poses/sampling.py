@@ -47,10 +47,12 @@ class PoseRanges:
             found.append(f"roll: {self.roll_max_deg} degrees; it must lie between 0 and 180.")
         if self.working_distance_mm is not None:
             nearest, farthest = self.working_distance_mm
-            if not 0 < nearest <= farthest:
+            if not 0 < nearest <= farthest < np.inf:
                 found.append(f"working distance: {nearest} to {farthest} mm; give nearest, then farthest, above 0 mm.")
-        if self.lateral_offset_mm is not None and self.lateral_offset_mm < 0:
-            found.append(f"lateral offset: {self.lateral_offset_mm} mm; it cannot be negative.")
+        if self.lateral_offset_mm is not None and not 0 <= self.lateral_offset_mm < np.inf:
+            found.append(f"lateral offset: {self.lateral_offset_mm} mm; give 0 or more.")
+        if not 0 <= self.in_view_min <= 1:
+            found.append(f"vessels in view: {self.in_view_min}; give a share between 0 and 1.")
         return found
 
     def to_dict(self) -> dict:
@@ -70,7 +72,7 @@ class PoseSampler:
     def __init__(
         self, craniotomy: Craniotomy, ranges: PoseRanges, camera: Camera, vessel_vertices_mm: np.ndarray, seed: int = 0
     ):
-        problems = ranges.problems()
+        problems = ranges.problems() + ([f"seed: {seed}; give 0 or more."] if seed < 0 else [])
         if problems:
             raise InputError(problems)
         radius_mm = np.linalg.norm(vessel_vertices_mm - vessel_vertices_mm.mean(axis=0), axis=1).max()
