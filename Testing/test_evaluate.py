@@ -203,6 +203,15 @@ def test_poses_of_another_case_are_compared_with_nothing(case, known, tmp_path):
     assert len(caught.value.problems) == 2 and all("of another case" in text for text in caught.value.problems)
 
 
+def test_poses_that_were_registered_are_not_taken_for_known(case, known, tmp_path):
+    """What `register` wrote, compared with the model that wrote it: 0.00 mm, 100 % within 3 mm and 3 degrees."""
+    evaluate(case, known, tmp_path / "out", predictor=ShiftedPredictor(known))
+    predicted = tmp_path / "out" / "predicted.json"
+    with pytest.raises(InputError, match="not known to be right"):
+        evaluate(case, predicted, tmp_path / "again", predicted_path=predicted)
+    assert not (tmp_path / "again").exists()
+
+
 def test_damaged_images_are_all_named(case, known, tmp_path):
     images = [frame.image for frame in read_poses(known)[1]]
     for i in (1, 2):

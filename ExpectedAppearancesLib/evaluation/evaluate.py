@@ -113,6 +113,11 @@ def known_frames(path: Path, styles: Sequence[str] | None, case: Case) -> tuple[
     problems = Problems()
     with problems.collect():
         check_vessels(path, case.vessels_sha256)
+    if any("accepted" in frame.extra for frame in frames):
+        problems.add(
+            f"{path}: its poses were registered, and are not known to be right; give a file of known poses, and this "
+            "one with --predicted."
+        )
     if styles:
         known = {frame.style for frame in frames}
         listed = ", ".join(sorted(style for style in known if style is not None)) or "none"
