@@ -2,6 +2,7 @@ import contextlib
 import copy
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,8 +25,15 @@ from ExpectedAppearancesLib.case.recorded import training_state
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.geometry.pose import transform
+from ExpectedAppearancesLib.masks.labels import VESSELS
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
-from ExpectedAppearancesLib.masks.stage import craniotomy_of, parenchyma_of, read_rendered, render_case
+from ExpectedAppearancesLib.masks.stage import (
+    craniotomy_of,
+    parenchyma_of,
+    pose_ranges_of,
+    read_rendered,
+    render_case,
+)
 from ExpectedAppearancesLib.model import checkpoint, training, views
 from ExpectedAppearancesLib.model.encoding import fit_encoding, network_camera
 from ExpectedAppearancesLib.model.feeder import Feeder, draw_views
@@ -34,8 +42,9 @@ from ExpectedAppearancesLib.model.networks import build_network
 from ExpectedAppearancesLib.model.presets import PRESETS
 from ExpectedAppearancesLib.model.training import train_case
 from ExpectedAppearancesLib.poses import sampling
-from ExpectedAppearancesLib.poses.sampling import PoseSampler
+from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
 from ExpectedAppearancesLib.registration.decoding import cell_pixels
+from ExpectedAppearancesLib.registration.poses_file import write_poses
 from ExpectedAppearancesLib.registration.predictor import Predictor
 from ExpectedAppearancesLib.runs.environment import library_environment
 
@@ -107,6 +116,26 @@ def test_views_show_at_each_cell_what_they_say(case, method, monkeypatch):
         agreeing.append(agreement(view))
     source.close()
     assert np.mean(agreeing) > 0.6  # vessels are about two cells wide: edges cost the rest
+
+
+def test_near_views_show_the_vessels_as_they_are_where_poses_may_be_far_too(case, tmp_path):
+    """Triangles for the farthest views of a wide range, 60 to 600 mm, left stumps of the vessels in the near ones."""
+    wide = Case.open(shutil.copytree(case.folder, tmp_path / "case"))
+    wide.record("render", ranges=replace(pose_ranges_of(case), working_distance_mm=(60.0, 600.0)).to_dict())
+    near = PoseSampler(
+        craniotomy_of(case), PoseRanges(working_distance_mm=(60, 70)), camera(), case.vessels.vertices_mm
+    )
+    frames = [{"image": f"{i}.png", "camera_from_world": near.sample(i)} for i in range(3)]
+    write_poses(tmp_path / "near.json", camera(), frames)
+    source = views.ViewSource(wide.folder, settings("surface", poses_file=str(tmp_path / "near.json")))
+    with MaskRenderer(case.vessels, case.cortex, network_camera(case.camera, 64)) as renderer:
+        for index in range(3):
+            view = source.view(index)
+            exact = renderer.render(view.camera_from_world).reshape(32, 2, 32, 2)
+            exact = ((exact == VESSELS).mean(axis=(1, 3)) >= 0.5) & (view.surface > 0)
+            drawn = (view.vessels > 0) & (view.surface > 0)
+            assert (exact & drawn).sum() / (exact | drawn).sum() > 0.75
+    source.close()
 
 
 def test_training_starts_at_the_shipped_weights_and_asks_for_them_when_it_goes_on(case, tmp_path, monkeypatch):

@@ -73,8 +73,10 @@ class ViewSource:
         self._oversampling = 2 if 2 * settings.size_px <= COMPOSED_PX else 1
         self._large = self.camera.resized(*(2 * [settings.size_px * self._oversampling]))
         self._sampler: PoseSampler = sampler_of(self.case, settings.seed)
-        farthest_px_mm = max(self._sampler.ranges.working_distance_mm) / self._large.fx
-        drawn = [mesh.simplified(DRAWN_TRIANGLE_PX * farthest_px_mm**2) for mesh in (self.case.vessels, parenchyma)]
+        nearest_mm, farthest_mm = self._sampler.ranges.working_distance_mm
+        # Of a wide range's farthest views the triangles would spoil the near ones.
+        px_mm = min(farthest_mm, 2 * nearest_mm) / self._large.fx
+        drawn = [mesh.simplified(DRAWN_TRIANGLE_PX * px_mm**2) for mesh in (self.case.vessels, parenchyma)]
         self._renderer = MaskRenderer(*drawn, self._large)
         _, appearances = read_appearances(self.case, settings.method)
         self._appearances = [a for a in appearances if a.style in settings.styles]
