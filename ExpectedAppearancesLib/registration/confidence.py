@@ -65,7 +65,8 @@ def calibrate(evidence: np.ndarray, good: np.ndarray) -> Confidence:
 
 
 def _threshold(probability: np.ndarray, good: np.ndarray) -> float:
-    """The lowest threshold at which accepted views are good often enough, and at least LEAST_PROBABILITY."""
+    """The lowest threshold at which accepted views are good often enough, at least LEAST_PROBABILITY, at most 0.99:
+    where even that lets more wrong ones through, the model's figures of validation say so."""
     order = np.argsort(-probability)
     precision = np.cumsum(good[order]) / np.arange(1, len(order) + 1)
     enough = np.nonzero(precision >= PRECISION_WANTED)[0]
