@@ -233,6 +233,22 @@ def test_frames_are_registered_anew_when_the_camera_beside_their_poses_was_corre
     assert told == [180.0] * 9 + [190.0] * 9 and len(calls(studied)) == 3
 
 
+def test_frames_that_were_made_anew_under_their_names_are_registered_anew(studied, no_pictures, monkeypatch):
+    """The report gave the figures of images that were not there any more. Models are not trained on them, and stay."""
+    told = []
+    usual = ShiftedPredictor.predict
+    monkeypatch.setattr(ShiftedPredictor, "predict", lambda *a: told.append(a[1][5, 5, 0]) or usual(*a))
+    both = replace(QUICK, protocols=("strict", "loto"))
+    run(studied, both)
+    image = files.read_image_rgb(studied.poses.parent / "3.png")
+    image[5, 5] = 91
+    files.write_png(studied.poses.parent / "3.png", image)
+    assert set(run(studied)["presets"]["quick"]) == {"strict"}  # the other protocol's figures are of the old one
+    assert told.count(91) == 1 and len(calls(studied)) == 6
+    run(studied, both)
+    assert told.count(91) == 2 and len(calls(studied)) == 6
+
+
 def test_later_parts_are_added_to_the_study_and_other_inputs_begin_a_new_one(studied, no_pictures):
     run(studied)
     run(studied, replace(QUICK, presets=("paper",)))

@@ -27,7 +27,7 @@ from .evaluate import Evaluation, check_frame, check_out, compare, known_frames,
 from .metrics import add_auc, nearest_other_pose_add_mm
 from .overlays import choose_frames, sheet
 from .study_folds import PROTOCOLS, SPACE_MB, FoldJob, is_trained, train_fold
-from .study_frames import FRAMES_PER_TEXTURE, check_poses, drawn_frames
+from .study_frames import FRAMES_PER_TEXTURE, check_poses, digest_of, drawn_frames
 from .verdict import STUDY_FORMAT
 
 FORMAT_VERSION = 1
@@ -213,6 +213,7 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
         "vessels_sha256": case.vessels_sha256,
         "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
         "poses_sha256": files.sha256(poses_path),
+        "frames_sha256": digest_of(frames),
     } | pose_settings(case.manifest)
     return StudyCase(case, poses_path, camera, frames, textures, styles, chosen, method, inputs)
 
@@ -233,7 +234,8 @@ def _jobs(one: StudyCase, settings: StudySettings) -> list[FoldJob]:
 
 def _job(one: StudyCase, settings: StudySettings, preset: str, protocol: str, name: str, exclude) -> FoldJob:
     given = {key: getattr(settings, key) for key in ("steps", "minutes") if getattr(settings, key) is not None}
-    inputs = {key: value for key, value in one.inputs.items() if key != "poses_sha256" or protocol == "loto"}
+    tested_on = {"frames_sha256"} | ({"poses_sha256"} if protocol != "loto" else set())
+    inputs = {key: value for key, value in one.inputs.items() if key not in tested_on}
     identity = {"preset": replace(PRESETS[preset], **given).to_dict(), "seed": settings.seed, "protocol": protocol}
     # A model of an older version cannot be read any more.
     identity |= {"exclude": list(exclude), "method": one.method, "inputs": inputs, "model_version": MODEL_VERSION}
@@ -332,8 +334,8 @@ def _of_folds(one: StudyCase, folds: dict[str, tuple[FoldJob, list[str]]]) -> Ev
 def _registered(one: StudyCase, job: FoldJob, frames: list[Frame]) -> list[Frame]:
     """Frames as the fold's model sees them; what was registered before with the same model is read again."""
     path, made_of = job.folder / "predicted.json", job.folder / "predicted.of.json"
-    of = {"model_sha256": files.sha256(job.folder / "model.onnx"), "poses_sha256": one.inputs["poses_sha256"]}
-    of["camera"] = one.camera.to_dict()  # may lie in a file of its own
+    of = {"model_sha256": files.sha256(job.folder / "model.onnx"), "camera": one.camera.to_dict()}
+    of |= {key: one.inputs[key] for key in ("poses_sha256", "frames_sha256")}
     if path.is_file() and made_of.is_file() and files.read_json(made_of, "record of predictions") == of:
         by_image = {frame.image: frame for frame in read_poses(path)[1]}
         if all(frame.image in by_image for frame in frames):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .. import files
@@ -12,7 +13,8 @@ from ..case.case import Case, pose_settings
 from ..errors import InputError
 from ..model.encoding import network_camera
 from ..model.views import ViewSettings, ViewSource
-from ..registration.poses_file import write_poses
+from ..registration.footage import video_and_number
+from ..registration.poses_file import Frame, write_poses
 
 FRAMES_PER_TEXTURE = 24
 FRAME_PX = 256  # twice what the networks read
@@ -84,6 +86,12 @@ def check_poses(case: Case, method: str | None, unseen: bool, seen: bool) -> Non
             "have seen the pose of a frame of it; study the protocol strict alone, or synthesise with the method "
             "surface."
         )
+
+
+def digest_of(frames: Sequence[Frame]) -> str:
+    """SHA-256 of the files that hold the frames: images are made anew, or corrected, under the names they had."""
+    named = {(video_and_number(frame.image) or (frame.image,))[0] for frame in frames}
+    return hashlib.sha256("".join(files.sha256(path) for path in sorted(named)).encode()).hexdigest()
 
 
 def _known(record: Path) -> dict | None:
