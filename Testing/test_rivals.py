@@ -11,6 +11,7 @@ import torch
 from cases import camera
 from test_training import CPU, TINY, case, settings  # noqa: F401 (case is a fixture)
 
+from ExpectedAppearancesLib.appearances.store import read_appearances
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.masks.stage import read_rendered
@@ -63,6 +64,14 @@ def test_every_reason_why_a_fold_cannot_be_trained_is_said(case, tmp_path, capsy
     write_poses(tmp_path / "far.json", camera(), [{"image": "0.png", "camera_from_world": far}])
     with pytest.raises(InputError, match="synthesised at any of its poses"):
         train_case(case, TINY, lambda *_: None, CPU, method="image", fold=Fold(tmp_path, (), tmp_path / "far.json"))
+
+
+def test_a_texture_that_is_seen_from_none_of_the_poses_is_not_used(case, poses_file):  # noqa: F811
+    """Where each pose is made in one texture: kept for choosing the epoch, it ended the training in numpy's error."""
+    _, made = read_appearances(case, "image")
+    own = [replace(a, style=style) for a, style in zip(made[::2], "abcd")]  # made: each pose in two textures
+    assert Fold(case.folder, (), poses_file).styles("image", own) == ["a", "b"]
+    assert Fold(case.folder, (), poses_file).styles("surface", own) == ["a", "b", "c", "d"]
 
 
 def test_both_parts_of_a_rival_learn_apart():

@@ -38,7 +38,10 @@ class Fold:
         if self.poses_path:
             with problems.collect():
                 poses = known_poses(self.poses_path)
-                if method == "image" and not any(seen_from(a, poses) for a in appearances if a.style in left):
+                if method == "image":  # a texture that is seen from none of them shows nothing to train or choose on
+                    seen = {a.style for a in appearances if a.style in left and seen_from(a, poses)}
+                    left = seen or left
+                if method == "image" and not seen:
                     problems.add(
                         f"{self.poses_path}: no appearance was synthesised at any of its poses; synthesise them with "
                         "the method surface, which can be seen from any pose."
