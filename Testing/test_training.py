@@ -169,6 +169,21 @@ def test_a_training_begins_anew_where_the_craniotomy_was_moved(case, tmp_path):
     assert first == same != other
 
 
+def test_a_training_begins_anew_where_the_poses_that_it_repeats_were_changed(case, tmp_path):
+    """In their file, whose name stays: `train --poses` called a finished model of the old ones that of the new."""
+    from ExpectedAppearancesLib.model import training
+
+    repeated = settings("surface", poses_file=str(tmp_path / "known.json"))
+    encoding = fit_encoding(np.stack([np.eye(4)] * 3), case.vessels.centroid_mm, case.vessels.radius_mm)
+    states = []
+    for count in (3, 3, 2):
+        frames = [{"image": f"{i}.png", "camera_from_world": np.eye(4)} for i in range(count)]
+        write_poses(tmp_path / "known.json", camera(), frames)
+        trainer = training._Trainer(case, TINY, encoding, CPU, 0, repeated, tmp_path)
+        states.append(trainer.state["settings"])
+    assert states[0] == states[1] != states[2]
+
+
 def test_views_depend_only_on_seed_and_index_and_have_poses_of_their_own(case):
     first = views.ViewSource(case.folder, settings("surface"))
     again = views.ViewSource(case.folder, settings("surface"))

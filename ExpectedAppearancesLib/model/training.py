@@ -174,6 +174,7 @@ class _Trainer:
         # The poses are drawn around the craniotomy, and what a regression's numbers mean comes from the poses.
         identity = f"{preset.to_dict()} {seed} {views} {self.appearances_sha256} {ranges} {self.plausible.to_dict()}"
         identity += files.sha256(SHIPPED) if started else ""
+        identity += files.sha256(Path(views.poses_file)) if views.poses_file else ""
         self.state = {
             "settings": {"sha256": hashlib.sha256(identity.encode()).hexdigest()},
             "step": 0,
