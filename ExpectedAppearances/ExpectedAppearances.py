@@ -100,7 +100,7 @@ CHOICE_LABELS = {
     "Method": {"SURFACE": "whole surface (recommended)", "IMAGE": "one image for each pose (as in the paper)"},
     "TrainingPreset": {
         "QUICK": "quick: for a processor",
-        "BEST": "best: for a graphics card",
+        "BEST": "best: finer, takes longer",
         "PAPER": "paper: for comparison only",
     },
     "StudyProtocols": {

@@ -21,8 +21,8 @@ def add_parser(subparsers) -> None:
         "--preset",
         choices=("quick", "best", "paper", "probseg", "binseg"),
         default="quick",
-        help="quick: for a CPU; best: larger and longer, for a GPU; paper: the paper's network, loss and schedule; "
-        "probseg, binseg: its rivals, which segment the vessels first",
+        help="quick: half an hour on a CPU; best: reads frames finer, 90 minutes; paper: the paper's network, loss and "
+        "schedule; probseg, binseg: its rivals, which segment the vessels first",
     )
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     parser.add_argument("--seed", type=int, default=0, help="seed of weights and views")

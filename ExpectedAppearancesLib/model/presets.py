@@ -40,7 +40,7 @@ class Preset:
 
 PRESETS = {
     "quick": Preset("quick", "dense", 128, 3000, 24, 8, 26.0, 2e-3, 2e-5),
-    "best": Preset("best", "dense", 192, 12000, 32, 16, 90.0, 2e-3, 1e-5, width=1.5, validate_every=400),
+    "best": Preset("best", "dense", 192, 6000, 24, 8, 90.0, 2e-3, 2e-5, validate_every=250),
     # 200 epochs of about 1,500 images, batch 8 (the paper's section 2.3); training sets the steps from the images.
     "paper": Preset(
         "paper",
