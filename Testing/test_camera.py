@@ -104,6 +104,34 @@ def test_damaged_opencv_calibration_is_bad_input(tmp_path):
             read_camera(path)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fisheye_model": 1, "distortion_coefficients": np.array([0.1, 0.01, 0.001, 0.0001])}, "fisheye"),
+        ({"camera_matrix": np.array([[700.0, 25.0, 320.0], [0, 700, 240], [0, 0, 1]])}, "skew"),
+        ({"camera_matrix": np.diag([700.0, 700.0, 2.0])}, "scaled"),
+        ({"distortion_coefficients": None}, "'distortion_coefficients' is missing"),
+    ],
+)
+def test_a_calibration_of_another_kind_of_camera_is_not_taken_for_opencvs_pinhole(tmp_path, change, words):
+    usual = {
+        "fisheye_model": 0,
+        "image_width": 640,
+        "image_height": 480,
+        "camera_matrix": np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]),
+        "distortion_coefficients": np.array([0.1, 0.01, 0.001, 0.0001, 0.0]),
+    }
+    for name, values in (("usual.yml", usual), ("changed.yml", usual | change)):
+        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+        for key, value in values.items():
+            if value is not None:
+                storage.write(key, value)
+        storage.release()
+    assert read_camera(tmp_path / "usual.yml").distortion[0] == 0.1
+    with pytest.raises(InputError, match=words):
+        read_camera(tmp_path / "changed.yml")
+
+
 @pytest.mark.parametrize("name", ["camera.json", "calibration.yml"])
 def test_a_calibration_that_may_not_be_read_is_bad_input(tmp_path, monkeypatch, name):
     (tmp_path / name).touch()

@@ -160,14 +160,28 @@ def _read_opencv_calibration(path: Path) -> Camera:
         matrix = storage.getNode("camera_matrix").mat()
         distortion = storage.getNode("distortion_coefficients").mat()
         width, height = (storage.getNode(key).real() for key in ("image_width", "image_height"))
+        fisheye = storage.getNode("fisheye_model")
+        is_fisheye = fisheye.isInt() and bool(fisheye.real())
     except (cv2.error, SystemError, UnicodeDecodeError, OSError) as error:
         raise InputError(
             f"{path}: not an OpenCV calibration file ({error}); save it with OpenCV's calibration."
         ) from error
     if matrix is None or matrix.shape != (3, 3):
         raise InputError(f"{path}: 'camera_matrix' (3x3) is missing; save it with OpenCV's calibration.")
+    # Each would be taken for another lens, and every pose be wrong.
+    problems = Problems()
+    if is_fisheye:
+        problems.add(f"{path}: is of a fisheye model, which is not known here; calibrate again without it.")
+    if distortion is None:
+        problems.add(f"{path}: 'distortion_coefficients' is missing; save it with OpenCV's calibration.")
+    if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0] or abs(matrix[2, 2] - 1) > 1e-6:
+        problems.add(
+            f"{path}: 'camera_matrix' has a skew ({matrix[0, 1]:g} px) or is scaled ({matrix[2, 2]:g} in its corner), "
+            "which is not known here; calibrate again without skew."
+        )
+    problems.raise_if_any()
     values = {"width": int(width), "height": int(height), "fx": matrix[0, 0], "fy": matrix[1, 1]}
     values |= {"cx": matrix[0, 2], "cy": matrix[1, 2]}
     values = {key: float(value) for key, value in values.items()}
-    values["distortion"] = [] if distortion is None else distortion.ravel().tolist()
+    values["distortion"] = distortion.ravel().tolist()
     return Camera.from_dict(values, str(path))
