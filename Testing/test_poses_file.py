@@ -85,6 +85,15 @@ def test_every_problem_is_reported_at_once(tmp_path):
     )
 
 
+@pytest.mark.parametrize("value", ["false", "", [], 2])
+def test_what_is_neither_true_nor_false_is_not_taken_for_an_accepted_frame(tmp_path, value):
+    frame = {"image": "a.png", "camera_from_world": POSE}
+    for known in (True, False, None):
+        assert read_poses(written(tmp_path, {"frames": [frame | {"accepted": known}]}))[1][0].accepted is bool(known)
+    with pytest.raises(InputError, match=r"a\.png.*'accepted'.*without quotes"):
+        read_poses(written(tmp_path, {"frames": [frame | {"accepted": value}]}))
+
+
 @pytest.mark.parametrize("value", [[], {}, {"frames": {}}, {"frames": []}, {"frames": [3]}])
 def test_files_without_frames_are_refused(tmp_path, value):
     with pytest.raises(InputError, match=r"poses\.json"):

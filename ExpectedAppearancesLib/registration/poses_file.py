@@ -120,6 +120,8 @@ def _frame(path: Path, index: int, entry) -> Frame:
     pose = entry.get("camera_from_world")
     if pose is not None:
         pose = _pose(where, pose)
+    if entry.get("accepted") not in (None, True, False):  # "false" would be true to Python, and a refused pose shown
+        raise InputError(f"{where}: 'accepted' is {entry['accepted']!r}; it must be true or false, without quotes.")
     style = entry.get("style")
     extra = {key: value for key, value in entry.items() if key not in _OWN_KEYS}
     image = Path(os.path.normpath(path.parent / entry["image"]))
