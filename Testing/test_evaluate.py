@@ -164,6 +164,14 @@ def test_command_compares_a_prediction_file_and_only_the_wanted_styles(case, kno
     assert "2.50" in capsys.readouterr().out
 
 
+def test_poses_of_another_program_are_compared_whatever_they_say_of_confidence_and_latency(case, known, tmp_path):
+    camera, frames = read_poses(known)
+    others = ({"confidence": 95.0}, {"confidence": "high"}, {"latency_ms": "12 ms"}, {"latency_ms": None}, {}, {})
+    write_poses(tmp_path / "p.json", camera, [f.to_dict() | other for f, other in zip(frames, others)])
+    result = evaluate(case, known, tmp_path / "out", predicted_path=tmp_path / "p.json").metrics
+    assert result["add_mm"]["mean"] == 0 and not {"latency_ms", "reliability"} & result.keys()
+
+
 def test_all_problems_at_once_and_nothing_written(case, known, tmp_path):
     images = [frame.image for frame in read_poses(known)[1]]
     images[0].unlink()

@@ -88,12 +88,13 @@ def compare(case: Case, camera: Camera, true: list[Frame], predicted: list[Frame
     result = metrics(errors, [frame.style for frame in true])
     baseline = np.broadcast_to(mean_pose(vertices_mm, true_poses), true_poses.shape)
     result["mean_pose_add_mm"] = float(add_mm(vertices_mm, true_poses, baseline).mean())
-    latency_ms = [frame.extra["latency_ms"] for frame in predicted if "latency_ms" in frame.extra]
+    # Of poses that another program wrote these may be anything.
+    latency_ms = [ms for frame in predicted if isinstance(ms := frame.extra.get("latency_ms"), (int, float))]
     if latency_ms:
         median, p95 = np.percentile(latency_ms, (50, 95))
         result["latency_ms"] = {"median": float(median), "p95": float(p95)}
     confidence = [frame.extra.get("confidence") for frame in predicted]
-    if None not in confidence:
+    if all(isinstance(value, (int, float)) and 0 <= value <= 1 for value in confidence):
         result["reliability"] = reliability(confidence, errors)
     return Evaluation(camera, true, predicted, errors, result)
 
