@@ -163,6 +163,8 @@ def test_space_is_read_from_the_header(tmp_path):
         assert declared_space(path) == space
         write_vtp(tmp_path / f"{space}.vtp", Mesh.from_polydata(sphere()), space)
         assert declared_space(tmp_path / f"{space}.vtp") == space
+        (tmp_path / f"{space}.vtp").rename(tmp_path / f"{space}-UPPER.VTP")
+        assert declared_space(tmp_path / f"{space}-UPPER.VTP") == space
     assert declared_space(save(sphere(), tmp_path / "plain.vtk")) is None
     assert declared_space(save(sphere(), tmp_path / "plain.vtp")) is None
     assert declared_space(tmp_path / "none.vtp") is None

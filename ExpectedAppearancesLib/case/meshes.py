@@ -199,7 +199,8 @@ def declared_space(path: Path) -> str | None:
             found = re.search(rb"SPACE=(LPS|RAS)", stream.read(2048))
         if found:
             return found.group(1).decode()
-        array = _read_polydata(path).GetFieldData().GetAbstractArray(SPACE_FIELD) if path.suffix == ".vtp" else None
+        is_vtp = path.suffix.lower() == ".vtp"
+        array = _read_polydata(path).GetFieldData().GetAbstractArray(SPACE_FIELD) if is_vtp else None
     except (OSError, InputError):  # read_mesh reports these
         return None
     value = array.GetValue(0) if array and array.IsA("vtkStringArray") and array.GetNumberOfValues() else None
