@@ -145,6 +145,16 @@ def test_a_file_cut_short_is_never_taken_for_a_whole_one(tmp_path, capfd, suffix
     assert capfd.readouterr().err == ""  # VTK's own messages stay off the terminal
 
 
+@pytest.mark.parametrize("suffix", list(WRITERS))
+def test_a_file_whose_second_half_was_never_written_is_refused(tmp_path, suffix):
+    """A drive that is pulled out leaves zeros: half of the vessels would be gone without a word."""
+    for binary in (True, False):
+        data = save(sphere(), tmp_path / f"whole.{suffix}", binary).read_bytes()
+        (tmp_path / f"zeros.{suffix}").write_bytes(data[: len(data) // 2].ljust(len(data), b"\0"))
+        with pytest.raises(InputError, match=r"zeros\."):
+            read_mesh(tmp_path / f"zeros.{suffix}", "vessel mesh")
+
+
 @pytest.mark.parametrize(("name", "words"), [("none.vtp", "not found"), ("scan.nii.gz", "unknown format")])
 def test_missing_and_unknown_files(tmp_path, name, words):
     (tmp_path / "scan.nii.gz").write_bytes(b"x")

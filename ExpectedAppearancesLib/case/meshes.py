@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from dataclasses import dataclass
@@ -217,6 +218,8 @@ def _read_polydata(path: Path):
     suffix = path.suffix.lower()
     if suffix == ".ply":
         _check_ply_is_whole(path)
+    if suffix in (".stl", ".ply"):
+        _check_end_is_written(path)
     readers = (vtkXMLPolyDataReader, vtkPolyDataReader, vtkSTLReader, vtkPLYReader, vtkOBJReader)
     reader = dict(zip(FORMATS, readers))[suffix]()
     reader.SetFileName(str(path))
@@ -237,6 +240,15 @@ def _read_polydata(path: Path):
     if trouble or "ERROR:" in window.GetOutput():
         raise InputError((trouble or messages or ["VTK reports an error"])[0].strip(" ."))
     return reader.GetOutput()
+
+
+def _check_end_is_written(path: Path) -> None:
+    """Raise InputError where zeros stand for the end, as a drive that was pulled out leaves a file: its triangles would
+    be gone without a word. No whole file ends so: the last triangle would have no corners."""
+    with open(path, "rb") as stream:
+        stream.seek(max(0, stream.seek(0, os.SEEK_END) - 32))
+        if not stream.read().strip(b"\0"):
+            raise InputError("its end was never written")
 
 
 def _check_ply_is_whole(path: Path) -> None:
