@@ -67,7 +67,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value) -> None:
-    write_bytes(path, (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode("utf-8"))
+    text = json.dumps(value, indent=1, ensure_ascii=False) + "\n"
+    # On Linux a file's name may be no text: half of a surrogate pair, which JSON has an escape for and UTF-8 not.
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def read_json(path: Path, what: str):
@@ -145,6 +147,17 @@ def sha256(path: Path) -> str:
         for block in iter(lambda: stream.read(1 << 20), b""):
             digest.update(block)
     return digest.hexdigest()
+
+
+def require_text(path: Path) -> None:
+    """Raise InputError for a path that is no text, as old archives leave some on Linux: onnxruntime cannot read there,
+    and OpenCV's videos crash."""
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{path}: this name, or that of a folder above it, is not in UTF-8; rename it without special letters."
+        ) from None
 
 
 def existing_parent(path: Path) -> Path:

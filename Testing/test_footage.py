@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import struct
+import sys
 
 import cv2
 import numpy as np
@@ -189,6 +192,30 @@ def test_frames_of_a_video_can_be_evaluated(case, video, tmp_path):
     assert len(overlays) == 12 and "00_Op ä#frame=0.png" in overlays
     video.unlink()
     assert main(compare) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are text elsewhere")
+def test_names_that_are_no_text_are_registered_or_refused_and_crash_nothing(case, video, tmp_path, capsys):
+    """Letters of another code page, as old archives and drives hold them: OpenCV crashed on such videos and captions,
+    and poses.json could not be written when all frames were registered."""
+    odd = os.fsdecode(b"M\xfcller")
+    files.write_png(tmp_path / f"{odd}.png", grey(LEVELS[0]))
+    out, files_of = tmp_path / "poses.json", [str(tmp_path / f"{odd}{suffix}") for suffix in (".png", ".avi", ".vtp")]
+    assert main(["register", str(case.folder), files_of[0], "--out", str(out)]) == 0
+    (frame,) = read_poses(out)[1]
+    assert str(frame.image) == files_of[0]
+    known = tmp_path / "known.json"
+    write_poses(known, None, [{"image": frame.image, "camera_from_world": frame.camera_from_world}])
+    compare = ["evaluate", str(case.folder), "--poses", str(known), "--predicted", str(out)]
+    assert main([*compare, "--out", str(tmp_path / "evaluation")]) == 0
+    capsys.readouterr()
+    shutil.copy(video, files_of[1])
+    assert main(["register", str(case.folder), files_of[1], "--out", str(out)]) == 2
+    shutil.copy(tmp_path / "vessels.vtp", files_of[2])
+    camera_path = str(tmp_path / "camera.json")
+    assert main(["new", str(tmp_path / "b"), "--vessels", files_of[2], "--camera", camera_path]) == 0
+    assert main(["new", str(tmp_path / odd), "--vessels", files_of[2], "--camera", camera_path]) == 2
+    assert capsys.readouterr().err.count("not in UTF-8") == 2
 
 
 def test_tracking_of_images_needs_their_rate_and_a_model_with_covariance(case, tmp_path, capsys, monkeypatch):

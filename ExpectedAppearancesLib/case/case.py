@@ -158,6 +158,7 @@ class Case:
         path = folder / MANIFEST_NAME
         if not path.is_file():
             raise InputError(f"{folder}: not a case folder (no {MANIFEST_NAME} in it); make one with `new`.")
+        files.require_text(folder)
         manifest = _read_manifest(path)
         problems = Problems()
         for name, entry in manifest["inputs"].items():
@@ -195,6 +196,8 @@ def pose_settings(manifest: dict) -> dict:
 
 
 def _check_new_folder(folder: Path, problems: Problems) -> None:
+    with problems.collect():
+        files.require_text(folder)
     if folder.is_file():
         problems.add(f"{folder}: is a file; give the name of a new folder.")
         return

@@ -222,7 +222,7 @@ def _read_polydata(path: Path):
         _check_end_is_written(path)
     readers = (vtkXMLPolyDataReader, vtkPolyDataReader, vtkSTLReader, vtkPLYReader, vtkOBJReader)
     reader = dict(zip(FORMATS, readers))[suffix]()
-    reader.SetFileName(str(path))
+    reader.SetFileName(os.fsencode(path))  # a name from an old archive may be no text
     # VTK reports trouble only as text in its output window, and then returns what it has got.
     usual_window, window = vtkOutputWindow.GetInstance(), vtkStringOutputWindow()
     usual_verbosity = vtkLogger.GetCurrentVerbosityCutoff()

@@ -64,7 +64,7 @@ def _first_writable(folders: list[Path], stem: str) -> tuple[Path | None, loggin
             path = folder / (f"{stem}.log" if attempt == 1 else f"{stem}-{attempt}.log")
             try:
                 folder.mkdir(parents=True, exist_ok=True)
-                return path, logging.FileHandler(path, mode="x", encoding="utf-8")
+                return path, logging.FileHandler(path, mode="x", encoding="utf-8", errors="backslashreplace")
             except FileExistsError:
                 continue  # another run began in the same second
             except OSError:

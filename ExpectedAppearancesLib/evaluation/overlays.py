@@ -70,6 +70,7 @@ def draw_box(
 
 def with_caption(image: np.ndarray, text: str) -> np.ndarray:
     """The frame with a line of ASCII text on a dark strip below it."""
+    text = text.encode("utf-8", "replace").decode()  # OpenCV crashes on a name that is no text
     height, width = image.shape[:2]
     strip = np.full((max(22, height // 20), width, 3), 24, np.uint8)
     scale, font = len(strip) / 40, cv2.FONT_HERSHEY_SIMPLEX

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from .. import files
 from ..errors import ExpectedAppearancesError, InputError
 from .frames import LiveFrame
 
@@ -203,6 +204,7 @@ class VideoFile:
             raise SourceLost(f"{self._path}: video not found; check the path, or wait for its drive to return.")
         import cv2
 
+        files.require_text(self._path)
         self._capture = cv2.VideoCapture(str(self._path))
         if not self._capture.isOpened():
             self.close()

@@ -133,6 +133,7 @@ def read_video_frame(path: Path) -> np.ndarray:
 def _open(path: Path):
     import cv2
 
+    files.require_text(path)
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         capture.release()
