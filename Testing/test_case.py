@@ -72,6 +72,20 @@ def test_a_case_without_cortex_and_with_a_camera_from_the_field_of_view(tmp_path
     assert case.camera.without_distortion() == camera
 
 
+def test_an_empty_folder_is_filled_and_not_replaced(tmp_path, inputs, monkeypatch):
+    """`new .` left the shell in a folder that was no more, and a link to another disk could not be taken."""
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / ".4711.part").mkdir()  # of a run that was killed
+    (tmp_path / "link").symlink_to(tmp_path / "here", target_is_directory=True)
+    monkeypatch.chdir(tmp_path / "here")
+    same = os.stat(".").st_ino
+    allowed = os.access  # one may own a folder in another that is the administrator's
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path and allowed(path, mode))
+    create(tmp_path / "link", inputs)
+    assert Case.open(Path(".")).folder == tmp_path / "here" and os.stat(tmp_path / "here").st_ino == same
+    assert set(os.listdir(".")) == {"vessels.vtp", "cortex.vtp", "camera.json", "case.json", ".4711.part"}
+
+
 def test_record_merges_and_keeps_what_others_recorded(tmp_path, inputs):
     first = create(tmp_path / "case", inputs)
     second = Case.open(tmp_path / "case")

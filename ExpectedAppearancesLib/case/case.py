@@ -85,7 +85,11 @@ class Case:
         folder = Path(folder).absolute()
         vessels, cortex, camera = Case.check_inputs(folder, vessels_path, cortex_path, camera_path, space)
         sources = {"vessels": vessels_path, "cortex": cortex_path}
-        part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+        part = (
+            folder / f".{os.getpid()}.part"
+            if folder.is_dir()
+            else folder.with_name(f".{folder.name}.{os.getpid()}.part")
+        )
         shutil.rmtree(part, ignore_errors=True)  # of a killed run that had the same process id
         try:
             with files.writing(folder):
@@ -109,9 +113,11 @@ class Case:
                     "stages": {},
                 }
                 files.write_json(part / MANIFEST_NAME, manifest)
-                if folder.exists():
-                    folder.rmdir()  # empty, as checked; os.replace onto a folder fails on Windows
-                os.replace(part, folder)
+                if part.parent == folder:  # it stays: a link, a disk's own folder, or where the user's shell stands
+                    for made in sorted(part.iterdir(), key=lambda path: path.name == MANIFEST_NAME):
+                        os.replace(made, folder / made.name)  # the manifest last, which makes it a case
+                else:
+                    os.replace(part, folder)
         except InputError as error:
             raise InputError(problem.replace(str(part), str(folder)) for problem in error.problems) from error
         finally:
@@ -201,10 +207,11 @@ def _check_new_folder(folder: Path, problems: Problems) -> None:
     if folder.is_file():
         problems.add(f"{folder}: is a file; give the name of a new folder.")
         return
-    if folder.is_dir() and any(folder.iterdir()):
+    # Of a run that was killed a hidden folder may be left.
+    if folder.is_dir() and any(not path.match(".*.part") for path in folder.iterdir()):
         problems.add(f"{folder}: exists and is not empty; give a new folder, or remove this one first.")
     with problems.collect():
-        files.require_writable(folder.parent)
+        files.require_writable(folder)
         files.require_space(folder, NEEDED_MB)
 
 
