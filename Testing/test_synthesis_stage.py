@@ -95,6 +95,16 @@ def test_label_maps_of_an_interrupted_drawing_are_not_taken_for_the_views_of_the
     assert len(read_rendered(case)) == 4
 
 
+def test_a_label_map_that_a_loss_of_power_left_empty_is_drawn_again(case):
+    """The very command that it was made by said that all were there."""
+    lost = case.masks_folder / "00002.png"
+    whole = lost.read_bytes()
+    for left in (b"", whole[: len(whole) // 2]):
+        lost.write_bytes(left)
+        render_case(case, lambda *_: None, poses=3)
+        assert lost.read_bytes() == whole
+
+
 def test_vessels_that_the_cortex_hides_in_all_views_are_told_before_hours_of_work(tmp_path):
     """As those of a scan below the surface of the dura or the head."""
     paths = write_inputs(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 
@@ -90,13 +91,19 @@ def render_case(
         for stale in (case.poses_path, *case.masks_folder.glob("*.png")):
             stale.unlink(missing_ok=True)
     case.record("render", **settings, done=False)
+    shows_vessels = False
     with MaskRenderer(case.vessels, parenchyma_of(case, craniotomy), case.camera, circular_field) as renderer:
         for i, matrix in enumerate(matrices):
             path = case.masks_folder / f"{i:05d}.png"
-            if not path.is_file():
-                files.write_png(path, renderer.render(matrix))
+            labels = None
+            with contextlib.suppress(InputError):  # missing, or left empty by a loss of power
+                labels = files.read_label_map(path)
+            if labels is None:
+                labels = renderer.render(matrix)
+                files.write_png(path, labels)
+            shows_vessels = shows_vessels or bool((labels == VESSELS).any())
             progress((i + 1) / poses, f"label map {i + 1} of {poses}")
-    if not any((files.read_label_map(case.masks_folder / f"{i:05d}.png") == VESSELS).any() for i in range(poses)):
+    if not shows_vessels:
         raise InputError(
             f"{case.folder}: none of the label maps shows a vessel, the cortex hides them all; make the case with a "
             "cortex that does not lie over them, or with none, or give the axis that points out of the head."
