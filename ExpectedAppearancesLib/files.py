@@ -42,6 +42,9 @@ def replacing(path: Path) -> Iterator[Path]:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
+            # Else a loss of power may leave an empty file of this name, and of the one before nothing.
+            with open(temporary, "rb+") as stream:
+                os.fsync(stream.fileno())
             _replace(temporary, path)
     finally:
         with contextlib.suppress(OSError):

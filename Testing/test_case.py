@@ -191,6 +191,16 @@ def test_a_drive_that_is_not_there_is_refused(tmp_path, inputs, monkeypatch):
         create(tmp_path / "case", inputs)
 
 
+def test_a_file_is_on_the_disk_before_it_takes_the_place_of_the_one_before(tmp_path, monkeypatch):
+    """XFS and NTFS write names before contents: a loss of power left an empty case.json."""
+    done, fsync, replace = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda number: (done.append(os.fstat(number).st_ino), fsync(number)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (done.append(("renamed", os.stat(a).st_ino)), replace(a, b)))
+    files.write_json(tmp_path / "a.json", {})
+    inode = (tmp_path / "a.json").stat().st_ino
+    assert done == [inode, ("renamed", inode)]
+
+
 def test_a_file_that_somebody_reads_is_replaced_when_he_has_done(tmp_path, monkeypatch):
     """Windows takes no file away from who reads it: a training ended where the panel looked at its checkpoint."""
     path, replace, times = tmp_path / "a.json", os.replace, iter([1, 1, 0])
