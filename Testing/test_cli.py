@@ -9,9 +9,11 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from ExpectedAppearancesLib import cli
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
 from ExpectedAppearancesLib.cli import check
+from ExpectedAppearancesLib.cli import logs as cli_logs
 from ExpectedAppearancesLib.cli.logs import log_file
 from ExpectedAppearancesLib.cli.progress import Progress, duration
 from ExpectedAppearancesLib.errors import CancelledError, ExpectedAppearancesError, InputError
@@ -178,6 +181,31 @@ def test_logs_fall_back_to_where_they_can_be_written(tmp_path, state_folder):
     with log_file("train", tmp_path) as path:
         logging.getLogger("anything").warning("kept")
     assert path.parent == state_folder and "kept" in path.read_text(encoding="utf-8")
+
+
+def test_a_command_needs_no_place_for_its_log(tmp_path, monkeypatch, capsys):
+    """A service's user without a home, a case that one may not look into, and disks that are all full."""
+    places = (
+        (cli_logs, "state_folder", RuntimeError("Could not determine home directory.")),
+        (tempfile, "gettempdir", FileNotFoundError("No usable temporary directory found")),
+        (Path, "is_file", PermissionError(errno.EACCES, "Permission denied")),
+    )
+    stand_in_command(monkeypatch, lambda _args, _progress: print("done"))
+    for owner, name, error in places:
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, Mock(side_effect=error))
+            assert cli.main(["render", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.split() == ["done"] * 3
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk here is always full")
+def test_a_log_on_a_full_disk_takes_nothing_from_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "ExpectedAppearancesLib.cli.logs._first_writable", lambda *_: (tmp_path, logging.FileHandler("/dev/full"))
+    )
+    stand_in_command(monkeypatch, lambda _args, progress: progress(1.0, "drawn"))
+    assert cli.main(["render", str(tmp_path)]) == 0
+    assert capsys.readouterr().err == "100 %  drawn\n"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends processes without a signal")

@@ -30,13 +30,18 @@ def log_file(command: str, case_folder: Path | None) -> Iterator[Path | None]:
 
     Without a case the file is in the user's state folder. Yields its path, None where nothing can be written.
     """
-    folders = [state_folder(), Path(tempfile.gettempdir())]
-    if case_folder and (Path(case_folder) / "case.json").is_file():
-        folders.insert(0, Path(case_folder).absolute() / "logs")
+    folders = []
+    if case_folder and os.path.isfile(Path(case_folder) / "case.json"):  # False, too, where one may not look
+        folders.append(Path(case_folder).absolute() / "logs")
+    for usual in (state_folder, tempfile.gettempdir):
+        # A user without a home, as services have none; disks that are all full.
+        with contextlib.suppress(RuntimeError, OSError):
+            folders.append(Path(usual()))
     path, handler = _first_writable(folders, f"{datetime.datetime.now(datetime.timezone.utc):%Y%m%dT%H%M%SZ}-{command}")
     root = logging.getLogger()
     usual_level = root.level
     if handler:
+        handler.handleError = lambda _record: None  # a full disk ends the log, not the command
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         root.addHandler(handler)
         root.setLevel(min(usual_level, logging.INFO))
@@ -55,7 +60,8 @@ def log_file(command: str, case_folder: Path | None) -> Iterator[Path | None]:
         root.setLevel(usual_level)
         if handler:
             root.removeHandler(handler)
-            handler.close()
+            with contextlib.suppress(OSError):
+                handler.close()
 
 
 def _first_writable(folders: list[Path], stem: str) -> tuple[Path | None, logging.Handler | None]:
