@@ -31,6 +31,17 @@ def writing(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Within the block, an OSError becomes an InputError that names `path` and the way out."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror or error}); check its drive, and that you may read it."
+        ) from error
+
+
+@contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary neighbour of `path` (same suffix) that replaces it if the block succeeds.
 
@@ -104,11 +115,11 @@ def read_image_rgb(path: Path) -> np.ndarray:
     import cv2
 
     path = Path(path)
-    if "#frame=" in path.name and not path.is_file():
+    if "#frame=" in path.name and not os.path.isfile(path):
         from .registration.footage import read_video_frame
 
         return read_video_frame(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"{path}: image not found; check the path.")
     image = _decoded(path, cv2.IMREAD_COLOR)
     if image is None:
@@ -120,7 +131,8 @@ def _decoded(path: Path, mode: int) -> np.ndarray | None:
     """As cv2.imread, which fails on non-ASCII paths on Windows; None for what is no image."""
     import cv2
 
-    data = np.frombuffer(path.read_bytes(), np.uint8)
+    with reading(path):
+        data = np.frombuffer(path.read_bytes(), np.uint8)
     try:
         return cv2.imdecode(data, mode) if data.size else None
     except cv2.error:  # the size that a damaged header tells
@@ -132,7 +144,7 @@ def read_label_map(path: Path) -> np.ndarray:
     import cv2
 
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"{path}: label map not found; check the path.")
     labels = _decoded(path, cv2.IMREAD_UNCHANGED)
     if labels is None:

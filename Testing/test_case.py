@@ -13,7 +13,7 @@ import pytest
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.case.meshes import Mesh, declared_space, write_vtp
+from ExpectedAppearancesLib.case.meshes import Mesh, declared_space, read_mesh, write_vtp
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import Camera, write_camera
 
@@ -84,6 +84,23 @@ def test_an_empty_folder_is_filled_and_not_replaced(tmp_path, inputs, monkeypatc
     create(tmp_path / "link", inputs)
     assert Case.open(Path(".")).folder == tmp_path / "here" and os.stat(tmp_path / "here").st_ino == same
     assert set(os.listdir(".")) == {"vessels.vtp", "cortex.vtp", "camera.json", "case.json", ".4711.part"}
+
+
+def test_each_file_that_may_not_be_read_is_a_problem_of_its_own(tmp_path, inputs, monkeypatch):
+    """Of many frames or meshes only the first was named, with the advice to free some space."""
+
+    def refused(*_arguments, **_named):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    create(tmp_path / "case", inputs)
+    with pytest.raises(InputError) as caught:
+        Case.open(tmp_path / "case", refused)
+    assert len(caught.value.problems) == 3
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    monkeypatch.setattr("builtins.open", refused)
+    for read in (files.read_image_rgb, files.read_label_map, lambda path: read_mesh(path, "mesh")):
+        with pytest.raises(InputError, match=r"vessels\.vtp: cannot be read \(Permission denied\)"):
+            read(inputs["vessels"])
 
 
 def test_record_merges_and_keeps_what_others_recorded(tmp_path, inputs):

@@ -162,19 +162,22 @@ class Case:
         """
         folder = Path(folder).absolute()
         path = folder / MANIFEST_NAME
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise InputError(f"{folder}: not a case folder (no {MANIFEST_NAME} in it); make one with `new`.")
         files.require_text(folder)
         manifest = _read_manifest(path)
         problems = Problems()
         for name, entry in manifest["inputs"].items():
-            if not (folder / entry["file"]).is_file():
-                problems.add(f"{folder / entry['file']}: {name} of the case is missing; restore it or make a new case.")
-            elif sha256(folder / entry["file"]) != entry["sha256"]:
-                problems.add(
-                    f"{folder / entry['file']}: {name} is not the file the case was made with (SHA-256 differs); "
-                    "restore it, or make a new case, since all stages rest on it."
-                )
+            file = folder / entry["file"]
+            if not os.path.isfile(file):
+                problems.add(f"{file}: {name} of the case is missing; restore it or make a new case.")
+                continue
+            with problems.collect(), files.reading(file):
+                if sha256(file) != entry["sha256"]:
+                    problems.add(
+                        f"{file}: {name} is not the file the case was made with (SHA-256 differs); "
+                        "restore it, or make a new case, since all stages rest on it."
+                    )
         problems.raise_if_any()
         return Case(folder, manifest, read_camera(folder / manifest["inputs"]["camera"]["file"]))
 

@@ -142,10 +142,12 @@ def _first_at_each_place(vertices_mm: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def read_mesh(path: Path, what: str) -> Mesh:
     """Mesh of a .vtp, .vtk, .stl, .ply or .obj file; `what` ("vessel mesh") names it in messages. Raises InputError."""
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"{path}: {what} not found; check the path.")
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: {what} has an unknown format; save it as one of {', '.join(FORMATS)}.")
+    with files.reading(path), open(path, "rb") as stream:
+        stream.read(1)
     try:
         mesh = Mesh.from_polydata(_read_polydata(path))
     except InputError as error:

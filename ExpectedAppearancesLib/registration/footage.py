@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +44,7 @@ class Footage:
         self._video = any(path.suffix.lower() in VIDEO_SUFFIXES for path in self._paths)
         problems = Problems()
         for path in self._paths:
-            if not path.is_file():
+            if not os.path.isfile(path):
                 problems.add(f"{path}: {'video' if self._video else 'image'} not found; check the path.")
         if self._video and len(self._paths) > 1:
             problems.add(f"{self._paths[0]}: a video is registered on its own; give one video, or only images.")
