@@ -198,6 +198,20 @@ def test_a_command_needs_no_place_for_its_log(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.split() == ["done"] * 3
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_has_gone_ends_no_command(tmp_path, inputs, unbuffered):
+    """As after `| head`, or a `| tee` that was ended while the training went on."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "ExpectedAppearancesLib", *new_arguments(tmp_path / "case", inputs)]
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered, "XDG_STATE_HOME": str(tmp_path)}
+    done = subprocess.run(command, stdout=writing, stderr=writing, cwd=ROOT, env=environment, check=False)
+    os.close(writing)
+    assert done.returncode == 0
+    (log,) = (tmp_path / "expected-appearances" / "logs").glob("*.log")
+    assert "exit code 0" in log.read_text(encoding="utf-8")
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk here is always full")
 def test_a_log_on_a_full_disk_takes_nothing_from_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(

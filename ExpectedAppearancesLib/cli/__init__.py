@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import errno
 import importlib
+import io
 import logging
 import signal
 import sys
@@ -61,15 +62,16 @@ def main(argv: Sequence[str] | None = None, progress: Progress | None = None) ->
         return EXIT_FAILED
 
     from .logs import log_file
-    from .progress import Progress
+    from .progress import Progress, tell
 
+    said = io.StringIO()
     progress = progress or Progress()
     # `new` must leave a case that it refuses to replace as it was.
     cases = getattr(args, "cases", None) or [getattr(args, "case", None)]
     case_folder = None if args.command == "new" else cases[0]
     with log_file(args.command, case_folder) as log_path:
         try:
-            with termination_cancels():
+            with termination_cancels(), contextlib.redirect_stdout(said):
                 code = args.run(args, progress)
             progress.finish()
             code = EXIT_DONE if code is None else int(code)
@@ -89,6 +91,7 @@ def main(argv: Sequence[str] | None = None, progress: Progress | None = None) ->
             _report_failure(error, log_path)
             code = getattr(error, "exit_code", EXIT_FAILED)
         logging.info("exit code %d", code)
+    tell(said.getvalue(), sys.stdout)
     return code
 
 
@@ -162,4 +165,6 @@ def say_problems(command: str, problems: list[str]) -> None:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    from .progress import tell
+
+    tell(text + "\n", sys.stderr)

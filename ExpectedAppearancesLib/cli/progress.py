@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import sys
 import time
 
@@ -55,7 +57,19 @@ class Progress:
         return f"{100 * fraction:3.0f} %  {message}{left}"
 
     def _show(self, fraction: float, message: str, seconds_left: float | None) -> None:
-        print(self._line(fraction, message, seconds_left), file=self._stream or sys.stderr, flush=True)
+        tell(self._line(fraction, message, seconds_left) + "\n", self._stream or sys.stderr)
+
+
+def tell(text: str, stream) -> None:
+    """Write at once. Who reads may be gone (`| head`, or the `tee` that Ctrl+C ended, too), or a disk be full: what is
+    under way must not end in the middle for that."""
+    try:
+        print(text, end="", file=stream, flush=True)
+    except OSError:
+        with contextlib.suppress(OSError):  # what is still to be written is thrown away, also when Python ends
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
 
 
 def duration(seconds: float) -> str:
