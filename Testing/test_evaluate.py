@@ -172,6 +172,18 @@ def test_poses_of_another_program_are_compared_whatever_they_say_of_confidence_a
     assert result["add_mm"]["mean"] == 0 and not {"latency_ms", "reliability"} & result.keys()
 
 
+def test_a_style_is_no_path(case, known, tmp_path):
+    """An overlay was written outside of --out, and a long name ended the evaluation when all was registered."""
+    camera, frames = read_poses(known)
+    styles = ("../../../up", "left/right", "ä" * 300, "a:b", "a", "")
+    write_poses(known, camera, [f.to_dict() | {"style": style} for f, style in zip(frames, styles)])
+    before = set(tmp_path.rglob("*.png"))
+    evaluate(case, known, tmp_path / "out", predicted_path=known)
+    made = sorted((set(tmp_path.rglob("*.png")) - before) - set((tmp_path / "out").glob("*.png")))
+    assert len(made) == FRAMES and {path.parent for path in made} == {tmp_path / "out" / "overlays"}
+    assert any(path.name.endswith("_left_right_1.png") for path in made)
+
+
 def test_all_problems_at_once_and_nothing_written(case, known, tmp_path):
     images = [frame.image for frame in read_poses(known)[1]]
     images[0].unlink()

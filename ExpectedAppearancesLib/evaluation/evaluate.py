@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,7 +213,10 @@ def _write_overlays(case: Case, evaluation: Evaluation, folder: Path) -> None:
     tiles = []
     for rank, (index, tile) in enumerate(zip(chosen, overlay_images(case, evaluation, chosen))):
         style = f"{evaluation.true[index].style}_" if evaluation.true[index].style else ""
-        files.write_png(folder / "overlays" / f"{rank:02d}_{style}{_name(evaluation.true[index].image)}.png", tile)
+        # A style is any text of a poses.json: no path, and nothing that a disk may refuse at the end of the work.
+        name = re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", f"{rank:02d}_{style}{_name(evaluation.true[index].image)}")
+        name = name.encode("utf-8", "replace")[:200].decode("utf-8", "ignore")
+        files.write_png(folder / "overlays" / f"{name}.png", tile)
         tiles.append(tile)
     files.write_png(folder / "overlays.png", sheet(tiles))
 
