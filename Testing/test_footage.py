@@ -174,7 +174,12 @@ def test_register_without_track_is_as_before(case, video, tmp_path):
 def test_register_says_before_it_begins_that_its_file_cannot_be_written(case, video, tmp_path, capsys, monkeypatch):
     """After an hour's video its poses would be lost."""
     monkeypatch.setattr(SteadyPredictor, "predict", lambda *_: pytest.fail("registered for nothing"))
-    for out, words in ((tmp_path, "is a folder"), (video / "poses.json", "nothing can be written here")):
+    places = (
+        (tmp_path, "is a folder"),
+        (video / "poses.json", "nothing can be written here"),
+        (video, "would be replaced"),  # --out forgotten before the frames' names
+    )
+    for out, words in places:
         assert main(["register", str(case.folder), str(video), "--out", str(out)]) == 2
         assert words in capsys.readouterr().err
 

@@ -102,6 +102,8 @@ def check_place(path: Path) -> None:
     path = Path(path).absolute()
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file in it, as poses.json.")
+    if path.exists() and path.suffix.lower() != ".json":  # the first of `--out frames/*.png` would be lost
+        raise InputError(f"{path}: is there and no poses file, and would be replaced; give a name such as poses.json.")
     files.require_writable(path.parent)
 
 
