@@ -1,8 +1,12 @@
 import pytest
+from cases import write_inputs
 
 from ExpectedAppearancesLib import files
+from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.demo import pipeline
 from ExpectedAppearancesLib.errors import ExpectedAppearancesError, InputError
+from ExpectedAppearancesLib.masks.stage import render_case
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
@@ -25,3 +29,24 @@ def test_a_failing_stage_ends_the_demo_and_is_named(tmp_path):
     """The stages are real commands in processes of their own: one with bad input must not be passed over."""
     with pytest.raises(ExpectedAppearancesError, match=r"`render .*exit code 2"):
         pipeline._run(["render", tmp_path / "no case"])
+
+
+def test_what_cannot_be_a_demo_is_bad_input(tmp_path, capsys):
+    """Each ended as a failure of the program."""
+    (tmp_path / "file").touch()
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "demo.json").touch()  # after a loss of power
+    for arguments, words in (
+        (["--out", str(tmp_path / "file")], "is a file"),
+        (["--out", str(tmp_path / "damaged")], "cannot be read as JSON"),
+        (["--out", str(tmp_path / "new"), "--seed", "-1"], "--seed at least 0"),
+    ):
+        assert main(["demo", *arguments]) == 2
+        assert words in capsys.readouterr().err
+
+
+def test_a_seed_below_0_is_bad_input(tmp_path):
+    paths = write_inputs(tmp_path)
+    case = Case.create(tmp_path / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
+    with pytest.raises(InputError, match="seed: -1"):
+        render_case(case, lambda *_: None, poses=1, seed=-1)

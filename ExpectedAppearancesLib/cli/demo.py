@@ -28,8 +28,8 @@ def run(args, progress) -> None:
     from ..demo.pipeline import run_demo
     from ..errors import InputError
 
-    if args.minutes <= 0 or args.textures < 1:
-        raise InputError("demo: --minutes must be above 0 and --textures at least 1.")
+    if args.minutes <= 0 or args.textures < 1 or args.seed < 0:
+        raise InputError("demo: --minutes must be above 0, --textures at least 1 and --seed at least 0.")
     metrics = run_demo(args.out, progress, args.seed, args.minutes, args.textures)
     accepted = metrics["frames"] - metrics["refused"]
     print(

@@ -34,9 +34,11 @@ def run_demo(
     out = Path(out)
     marker = out / "demo.json"
     settings = {"seed": seed, "minutes": minutes, "textures": textures}
+    if out.is_file():
+        raise InputError(f"{out}: is a file; give a new folder with --out.")
     if out.exists() and any(out.iterdir()):
-        known = marker.is_file() and json.loads(marker.read_text(encoding="utf-8"))
-        if not known:
+        known = marker.is_file() and files.read_json(marker, "settings of the demo")
+        if not isinstance(known, dict) or not known:
             raise InputError(f"{out}: exists and is no demo; give a new folder with --out.")
         if known != settings:
             made = ", ".join(f"{name} {known.get(name)}" for name in settings)
