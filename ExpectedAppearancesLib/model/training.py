@@ -46,6 +46,7 @@ CHECKPOINT_EVERY_S, CHECKPOINT_AT_LEAST_EVERY_S = 10.0, 45.0
 CHECKPOINT_SHARE = 0.01  # of the time that a training may spend on saving itself
 CALIBRATION = 8  # times as many views as for validation: one wrong one in a hundred accepted is to be counted
 LEAST_CALIBRATION = 2  # where no more views were drawn in training
+BENT_MORE = 2  # calibration's views than training's: brains shift farther, and more would fold them (elastic.py)
 LARGEST_COUNTED_ADD_MM = 20.0  # a lost view counts as this much, however far its pose is
 AVERAGE_DECAY = 0.995
 
@@ -102,7 +103,8 @@ def train_case(
     drawn = trainer.state["drawn"] * preset.fresh
     count = int(np.clip(drawn, *(times * preset.validation_views for times in (LEAST_CALIBRATION, CALIBRATION))))
     progress(1.0, f"calibrating confidence on {count} views")
-    calibration_views = replace(validation_views, negatives=0.3, seed=seed + 2001)
+    bent_px = BENT_MORE * preset.elastic_px
+    calibration_views = replace(validation_views, negatives=0.3, elastic_px=bent_px, seed=seed + 2001)
     calibration = draw_views(case.folder, calibration_views, count, workers)
     figures = trainer.export(calibration, validation, on_record)
     if fold is None:
