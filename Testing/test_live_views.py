@@ -150,6 +150,38 @@ def test_hidden_vessels_leave_an_empty_layer_which_goes_with_the_users_wish_only
     assert ours.composite.GetLabelVolumeID() is None
 
 
+def test_nothing_of_the_patient_is_drawn_over_a_frame_without_a_pose(case, application):
+    """The segmentation that the vessels were taken from is in the scene, too, and is cut by each slice view's plane:
+    under the words NO OVERLAY its vessels lay over the picture, where the pose before had them."""
+    scene, logic = application
+    view, live = SliceView(scene, logic, "Microscope", (CAMERA.width, CAMERA.height)), LiveScene(scene, case)
+    views = LiveViews(view.logic, lambda: None)
+    planned = scene.AddNewNodeByClass("vtkMRMLModelNode", "Planned")  # is drawn as segments are, by default
+    planned.SetAndObservePolyData(live.models["Vessels"].GetPolyData())
+    planned.CreateDefaultDisplayNodes()
+    planned.GetDisplayNode().SetVisibility2D(True)
+    for seed, accepted in enumerate((True, False, True, False)):
+        result = result_of(case, accepted, seed)
+        live.show(result)
+        views.follow(live, seed == 0)
+        view.draw_layers()
+        over = (view.pixels() != result.image_rgb).any(axis=2).sum()
+        assert (over > 1000) if accepted else (over == 0)
+        assert live.camera_to_ras == pytest.approx(_matrix(live.transform.GetMatrixTransformToWorld))
+    live.show_truth(result_of(case).overlay, CAMERA)  # aligned by hand to a frame that was refused
+    views.follow(live, False)
+    planned.SetDisplayVisibility(False)
+    shown = view.pixels()
+    assert (shown != result.image_rgb).any(axis=2).sum() > 500
+    live.put_picture_aside(False)
+    live_views.align_slice(view.node, CAMERA, live.picture_to_world, live.plane_mm)
+    np.testing.assert_array_equal(view.pixels(), shown)
+    live.put_picture_aside(True)
+    views.leave()
+    assert live.frame.GetParentTransformNode() is live.transform
+    live.close()
+
+
 def test_the_mri_is_cut_along_the_optical_axis_only_while_the_pose_holds(case, application):
     """No words stand over that view: what is seen in it must be of this frame."""
     scene, logic = application

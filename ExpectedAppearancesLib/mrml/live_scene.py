@@ -21,7 +21,8 @@ from .live_nodes import ROLE_ATTRIBUTE, mark, node_of_role, remove_live_nodes
 FIRST_PLANE_MM = 200.0  # where the frame is put up before any pose says how far the vessels are
 PLANE_CHANGE = 0.1  # share by which the vessels' depth may leave the plane before the plane follows
 TRUE_RGB, PREDICTED_RGB = (0.16, 0.86, 0.24), (0.20, 0.43, 1.0)  # the paper's figure: true green, predicted blue
-FRAME, TRANSFORM, FRUSTUM = "frame", "transform", "frustum"
+ASIDE_MM = 1e5  # farther than anything of a patient lies
+FRAME, TRANSFORM, FRUSTUM, ASIDE = "frame", "transform", "frustum", "aside"
 OUTLINE, TRUTH, BOX, FILL, COLOURS, BACKDROP = "outline", "truth", "box", "fill", "colours", "backdrop"
 NAMES = {OUTLINE: "Predicted outline", TRUTH: "True outline", BOX: "Vessel box"}
 RGB = {OUTLINE: PREDICTED_RGB, TRUTH: TRUE_RGB, BOX: (1.0, 0.82, 0.2)}
@@ -66,6 +67,7 @@ class LiveScene:
         else:
             self.camera_to_ras = matrix_of(self.transform)
         self.frame = node_of_role(scene, FRAME)
+        self._aside, self._is_aside = self._add_aside(), False
         self.frustum = None
         self.lines = {role: self._add_lines(role) for role in NAMES}
         self._filled = np.zeros((2, 2), np.uint8)
@@ -119,6 +121,19 @@ class LiveScene:
     def camera_to_world(self) -> np.ndarray:
         """Camera mm to what the views show: RAS, moved as the case's models are where they hang under a transform."""
         return matrix_of(self.transform, to_world=True)
+
+    @property
+    def picture_to_world(self) -> np.ndarray:
+        """Camera mm to where the picture is seen in the microscope's view."""
+        return self.camera_to_world @ _aside_matrix() if self._is_aside else self.camera_to_world
+
+    def put_picture_aside(self, aside: bool) -> None:
+        """Move the picture far along the optical axis, or back. Slicer draws in the microscope's view what its plane
+        cuts: over a frame without a pose, segments and curves would be an overlay of the pose before."""
+        self._is_aside = aside
+        wanted = self._aside if aside else self.transform
+        if self.frame is not None and self.frame.GetParentTransformNode() is not wanted:
+            self.frame.SetAndObserveTransformNodeID(wanted.GetID())
 
     def follow_models(self) -> None:
         """Hang camera and frame under the linear transform that the user put the vessels under, if any."""
@@ -250,6 +265,7 @@ class LiveScene:
 
     def close(self) -> None:
         """Take the live nodes out of the scene; those that a recording plays into stay, hidden overlay aside."""
+        self.put_picture_aside(False)
         remove_live_nodes(self._scene)
 
     def _set_geometry(self, camera: Camera, overlay: Overlay | None) -> bool:
@@ -297,6 +313,13 @@ class LiveScene:
         small = camera.resized(*self.fill.GetImageData().GetDimensions()[:2])
         self.fill.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(small, self.plane_mm)))
 
+    def _add_aside(self):
+        node = mark(self._scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Microscope picture aside"), ASIDE)
+        node.SetHideFromEditors(True)
+        scenes.set_pose(node, _aside_matrix())
+        node.SetAndObserveTransformNodeID(self.transform.GetID())
+        return node
+
     def _add_lines(self, role: str):
         from vtkmodules.vtkCommonDataModel import vtkPolyData
 
@@ -341,6 +364,13 @@ class LiveScene:
         node.SetSaveWithScene(False)
         node.GetDisplayNode().SetSaveWithScene(False)
         return node
+
+
+def _aside_matrix() -> np.ndarray:
+    """Camera mm to camera mm."""
+    matrix = np.eye(4)
+    matrix[2, 3] = ASIDE_MM
+    return matrix
 
 
 def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:

@@ -75,14 +75,18 @@ class LiveViews:
         self._line_view_ids = line_view_ids
         self._fitted: tuple | None = None
         self._depth_fitted = None
+        self._live: LiveScene | None = None  # what was followed last
         self._aimed: tuple | None = None  # the camera node that looks through the microscope's, and from where
 
     def follow(self, live: LiveScene, changed: bool) -> None:
         """Lay all views onto the frame of `live`; what depends on a pose that is not trusted is not shown."""
         size = self._slice.GetDimensions()[:2]
         camera_to_world = live.camera_to_world
+        visible = live.vessels_visible
+        live.put_picture_aside(not visible)
+        self._live = live
         sample_by_rows(self._slice)
-        align_slice(self._slice, live.camera, camera_to_world, live.plane_mm)
+        align_slice(self._slice, live.camera, live.picture_to_world, live.plane_mm)
         if changed or self._fitted != (size, live.camera):
             self._fitted = (size, live.camera)
             fit_slice(self._slice, live.camera, live.plane_mm)
@@ -90,7 +94,6 @@ class LiveViews:
         live.show_lines_in(self._line_view_ids)
         show_layers(self._composite, live.frame, live.fill, live.fill_opacity)
         self._intensity.skip()
-        visible = live.vessels_visible
         if bool(self._slice.GetSliceVisible()) != visible:
             self._slice.SetSliceVisible(visible)
         depth = self._depth_view()
@@ -133,7 +136,9 @@ class LiveViews:
     def leave(self) -> None:
         """Nothing of the live frame stays in the views."""
         self.let_go()
-        self._aimed = None
+        if self._live is not None:
+            self._live.put_picture_aside(False)  # where CameraToRAS has it, for other modules and files
+        self._aimed = self._live = None
         self._slice.SetSliceVisible(False)
         for put in (self._composite.SetBackgroundVolumeID, self._composite.SetLabelVolumeID):
             put(None)
