@@ -383,6 +383,32 @@ def test_a_model_of_another_case_is_refused(phantom, tmp_path):
         open_model(other.case)
 
 
+def test_vessels_of_the_patient_who_is_planned_are_not_seen_over_another_ones_picture(
+    application, phantom, model, frames, tmp_path
+):
+    """Both heads lie about the middle of Slicer's world: the view through the camera drew both, in one colour."""
+    scene, _logic = application
+    node_with(scene, frames[1][0])
+    planning = slicer.vtkMRMLScriptedModuleNode()
+    planning.SetSingletonTag("ExpectedAppearances")
+    planning = scene.AddNode(planning)
+    planned = {role: scene.AddNewNodeByClass("vtkMRMLModelNode") for role in ("vesselsNode", "cortexModel")}
+    for role, node in planned.items():
+        node.CreateDefaultDisplayNodes()
+        planning.SetNodeReferenceID(role, node.GetID())
+    controller = LiveController(scene)
+    for folder, seen in ((phantom.case.folder, True), (tmp_path, False)):  # the second time the case is open already
+        planning.SetParameter("casePath", str(folder))
+        controller.start(choice_of(phantom, stale_s=60), model=model)
+        wait_for(controller, lambda s: s.new)
+        assert [bool(node.GetDisplayVisibility()) for node in planned.values()] == [seen] * 2
+        assert controller.live.models["Vessels"].GetDisplayVisibility()
+        controller.stop()
+    controller.leave()
+    assert all(node.GetDisplayVisibility() for node in planned.values())
+    controller.close()
+
+
 def test_frame_pose_and_overlay_change_while_nothing_is_drawn(application, phantom, model, frames):
     """A busy Slicer draws at the first change already: the new frame with the outline of the one before."""
     scene, _logic = application

@@ -171,7 +171,7 @@ controller.running, controller.recorder = True, None
 def stop():
     controller.running = False
     shown.clear()
-controller.stop = stop
+controller.stop = controller.leave = stop
 controller.look_at = lambda browser, _case: shown.append(browser) or controller.status
 slicer.mrmlScene = MagicMock()
 slicer.mrmlScene.IsBatchProcessing.return_value = False

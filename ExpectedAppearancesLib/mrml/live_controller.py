@@ -30,7 +30,7 @@ from ..poses.craniotomy import find_craniotomy
 from . import live_record
 from .live_align import Alignment, pose_of_landmarks
 from .live_drawing import at_once
-from .live_nodes import ROLE_ATTRIBUTE, node_of_role, remove_live_nodes
+from .live_nodes import ROLE_ATTRIBUTE, hide_another_case, node_of_role, remove_live_nodes
 from .live_scene import FRAME, PLANE_CHANGE, LiveScene, OverlayOptions
 from .live_stream import NodeFrames, find_volume
 
@@ -69,6 +69,7 @@ class LiveController:
         self._registers = True
         self._overlays: OverlayMaker | None = None
         self._replayed: tuple | None = None
+        self._hidden: list = []  # models of another case
         self._seen_from: np.ndarray | None = None  # camera to world, as the views were laid out last
 
     @property
@@ -100,6 +101,7 @@ class LiveController:
             case = Case.open(folder)
             case.vessels, case.cortex  # noqa: B018 - read now, so that what is wrong with them is said now
             self._put_up(case, OverlayMaker(case.vessels))
+        self._hidden += hide_another_case(self._scene, self.case.folder)
         return self.case
 
     @at_once
@@ -148,9 +150,17 @@ class LiveController:
             self.live.show_truth(None, None)
             self._set_visible(False)
 
-    def close(self) -> None:
-        """Stop, and take everything out of the scene but recordings."""
+    def leave(self) -> None:
+        """Stop; what was hidden for the session is seen again in other modules."""
         self.stop()
+        for node in self._hidden:
+            if self._scene.IsNodePresent(node):
+                node.SetDisplayVisibility(True)
+        self._hidden = []
+
+    def close(self) -> None:
+        """Leave, and take everything out of the scene but recordings."""
+        self.leave()
         if self.live is not None:
             self.live.close()
         else:
@@ -165,6 +175,7 @@ class LiveController:
             self._session.stop()
         self._stream = self._session = self.live = self.case = self.recorder = self.alignment = None
         self._model = self._overlays = self._replayed = self.truth = self._loading = self._begin = None
+        self._hidden = []
         self.status = IDLE
 
     def freeze(self) -> None:
@@ -395,6 +406,7 @@ class LiveController:
     def _start_session(self, loaded: Loaded, choice: Choice, single: bool, node) -> None:
         if self.case is not loaded.case:
             self._put_up(loaded.case, loaded.overlays)
+        self._hidden += hide_another_case(self._scene, self.case.folder)
         self._registers = loaded.model is not None
         if loaded.model is not None:
             self._model = loaded.model

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 ROLE_ATTRIBUTE = "ExpectedAppearances.Live"  # on every node of the live panel: its role
 SEQUENCE_ATTRIBUTE = ROLE_ATTRIBUTE + ".Sequence"  # on every sequence of a recording: the role of what it plays into
 
@@ -38,6 +40,20 @@ def _browsers(scene) -> list:
 def is_recorded(scene, node) -> bool:
     """Whether a sequence browser plays into the node."""
     return any(browser.IsProxyNode(node.GetID()) for browser in _browsers(scene))
+
+
+def hide_another_case(scene, folder: Path) -> list:
+    """Hide the models of the planning panel where it has another case than that in `folder` open: through the camera
+    they would be seen over the picture of a patient who is not theirs. Returns those that were visible."""
+    planning = scene.GetSingletonNode("ExpectedAppearances", "vtkMRMLScriptedModuleNode")
+    planned = planning.GetParameter("casePath") if planning is not None else ""
+    if not planned or Path(planned).absolute() == folder:
+        return []
+    nodes = [planning.GetNodeReference(role) for role in ("vesselsNode", "cortexModel")]
+    hidden = [node for node in nodes if node is not None and node.GetDisplayVisibility()]
+    for node in hidden:
+        node.SetDisplayVisibility(False)
+    return hidden
 
 
 def remove_live_nodes(scene, but: tuple[str, ...] = ()) -> None:

@@ -88,7 +88,7 @@ class LivePanel:
         self._timer.stop()
         self.stop()
         self.record.close()
-        self.controller.stop()  # a recording that is looked at has come back with the end of the session
+        self.controller.leave()  # a recording that is looked at has come back with the end of the session
         self.layout.leave()
 
     def close(self) -> None:
