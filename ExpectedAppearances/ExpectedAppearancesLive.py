@@ -138,7 +138,10 @@ class ExpectedAppearancesLiveWidget(ScriptedLoadableModuleWidget, VTKObservation
             self.panel.close()
 
     def enter(self):
-        self.setParameterNode(self.logic.getParameterNode())
+        # Not at each visit: Slicer 5.8 lets go of no parameters that were ever bound, and each would hear every change.
+        if self._parameterNode is None:
+            self.setParameterNode(self.logic.getParameterNode())
+        self.panel.refresh()  # a model may have been trained meanwhile
         self.panel.enter()
 
     def exit(self):

@@ -20,6 +20,31 @@ for scene in range(2):
     )
 
 
+def test_parameters_are_bound_once_and_looked_at_at_each_visit(tmp_path):
+    """Slicer 5.8 never ends what was bound: after some dozens of visits each change took the panel tens of ms."""
+    in_the_live_panel(
+        """
+from pathlib import Path
+widget = module.ExpectedAppearancesLiveWidget()
+widget.addObserver = widget.removeObserver = MagicMock()
+widget.logic, widget.panel = MagicMock(), panel
+node = widget.logic.getParameterNode.return_value = parameter_node()
+node.casePath, node.sourcePath = sys.argv[2], sys.argv[2]
+panel._missing, panel.layout, panel.controller.restore = "", MagicMock(), MagicMock()
+widget.enter()
+assert "case.json" in panel._problem, panel._problem
+Path(sys.argv[2], "model").mkdir()
+for name in ("case.json", "model/model.onnx"):
+    Path(sys.argv[2], name).touch()
+for _visit in range(3):
+    widget.enter()
+    assert panel._problem == "", panel._problem
+assert node.connectGui.call_count == 1
+""",
+        tmp_path,
+    )
+
+
 def test_why_the_sample_cannot_be_made_is_said_in_the_panel(tmp_path):
     in_the_live_panel(
         """
