@@ -155,6 +155,22 @@ def test_a_file_whose_second_half_was_never_written_is_refused(tmp_path, suffix)
             read_mesh(tmp_path / f"zeros.{suffix}", "vessel mesh")
 
 
+def test_a_binary_stl_cut_short_is_refused_by_a_vtk_that_takes_it(tmp_path, monkeypatch):
+    """As that of Slicer 5.8 does: of a vessel tree the first half was the whole."""
+    from vtkmodules import vtkIOGeometry
+
+    whole = save(sphere(), tmp_path / "whole.stl", True)
+    half = tmp_path / "half.stl"
+    half.write_bytes(whole.read_bytes()[:-50])
+    reader = type(
+        "Reader", (), {"SetFileName": lambda *_: None, "Update": lambda _: None, "GetOutput": lambda _: sphere()}
+    )
+    monkeypatch.setattr(vtkIOGeometry, "vtkSTLReader", reader)
+    assert len(read_mesh(whole, "vessel mesh").triangles)
+    with pytest.raises(InputError, match="cut"):
+        read_mesh(half, "vessel mesh")
+
+
 @pytest.mark.parametrize(("name", "words"), [("none.vtp", "not found"), ("scan.nii.gz", "unknown format")])
 def test_missing_and_unknown_files(tmp_path, name, words):
     (tmp_path / "scan.nii.gz").write_bytes(b"x")
