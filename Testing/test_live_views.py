@@ -290,7 +290,7 @@ def test_no_overlay_where_the_vessels_in_the_scene_were_changed(application, pha
     controller.close()
 
 
-def test_the_view_through_the_camera_stays_there_while_a_frame_is_held(application, phantom, model, frames):
+def test_the_views_stay_there_while_a_frame_is_held(application, phantom, model, frames):
     """Zoomed or turned, vessels would lie on other parts of the picture behind them, under words that they belong to
     it."""
     scene, logic = application
@@ -306,6 +306,14 @@ def test_the_view_through_the_camera_stays_there_while_a_frame_is_held(applicati
         controller.tick()
         np.testing.assert_allclose(camera.GetPosition(), controller.live.camera_to_world[:3, 3])
         assert not camera.GetParallelProjection()
+    offset_mm = view.logic.GetSliceOffset()
+    view.logic.SetSliceOffset(offset_mm + 5)  # the mouse's wheel: the outline was left without its picture
+    controller.tick()
+    assert view.logic.GetSliceOffset() == pytest.approx(offset_mm) and apart_mm(view.node, controller.live) < 1e-6
+    view.logic.SetSliceOffset(offset_mm)
+    view.node.SetXYZOrigin(3, 4, 0)  # panning is the user's
+    controller.tick()
+    assert view.node.GetXYZOrigin()[:2] == (3, 4)
     controller.stop()
     away = camera.GetPosition()
     controller.tick()

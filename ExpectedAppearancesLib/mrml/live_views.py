@@ -76,6 +76,7 @@ class LiveViews:
         self._fitted: tuple | None = None
         self._depth_fitted = None
         self._live: LiveScene | None = None  # what was followed last
+        self._laid: list | None = None  # where the slice was laid
         self._aimed: tuple | None = None  # the camera node that looks through the microscope's, and from where
 
     def follow(self, live: LiveScene, changed: bool) -> None:
@@ -87,6 +88,7 @@ class LiveViews:
         self._live = live
         sample_by_rows(self._slice)
         align_slice(self._slice, live.camera, live.picture_to_world, live.plane_mm)
+        self._laid = _lies(self._slice)
         if changed or self._fitted != (size, live.camera):
             self._fitted = (size, live.camera)
             fit_slice(self._slice, live.camera, live.plane_mm)
@@ -111,8 +113,9 @@ class LiveViews:
 
     def was_moved(self) -> bool:
         """Whether the user turned or zoomed the view through the camera: from elsewhere the vessels lie on other parts
-        of the picture behind them."""
-        return self._aimed is not None and self._aimed[1] != _place_of(self._aimed[0])
+        of the picture behind them. Or moved the slice, as the mouse's wheel does: outlines stay without the picture."""
+        aimed = self._aimed is not None and self._aimed[1] != _place_of(self._aimed[0])
+        return aimed or (self._laid is not None and self._laid != _lies(self._slice))
 
     def _follow_in_depth(self, view: tuple, live: LiveScene, camera_to_world: np.ndarray, changed: bool) -> None:
         slice_node, composite, volume_id = view
@@ -138,7 +141,7 @@ class LiveViews:
         self.let_go()
         if self._live is not None:
             self._live.put_picture_aside(False)  # where CameraToRAS has it, for other modules and files
-        self._aimed = self._live = None
+        self._aimed = self._laid = self._live = None
         self._slice.SetSliceVisible(False)
         for put in (self._composite.SetBackgroundVolumeID, self._composite.SetLabelVolumeID):
             put(None)
@@ -291,6 +294,11 @@ def aim_camera(camera_node, view_size_px: tuple[int, int], camera: Camera, camer
 
 def _place_of(camera_node) -> tuple:
     return camera_node.GetPosition(), camera_node.GetParallelProjection()
+
+
+def _lies(slice_node) -> list:
+    matrix = slice_node.GetSliceToRAS()
+    return [matrix.GetElement(i, j) for i in range(4) for j in range(4)]
 
 
 def look_away(camera_node) -> None:
