@@ -161,7 +161,7 @@ class ExpectedAppearancesParameterNode:
     studyProtocols: StudyProtocols = StudyProtocols.BOTH
     acceptedAddLimitMm: Annotated[float, WithinRange(0.1, 100)] = 1.5
     acceptedRightLimitPercent: Annotated[float, WithinRange(0, 100)] = 97.0
-    acceptedLimitPercent: Annotated[float, WithinRange(0, 100)] = 30.0
+    acceptedLimitPercent: Annotated[float, WithinRange(0, 100)] = 20.0
 
     whenClosing: WhenClosing = WhenClosing.ASK
 

@@ -318,9 +318,9 @@ def test_verdict_is_about_what_is_shown():
 
 
 def test_verdict_on_the_models_own_validation():
-    values = {"add_mm_mean": 5.2, "accepted_add_mm_mean": 1.0, "accepted_add_below_3mm": 0.98, "accepted_of_true": 0.2}
+    values = {"add_mm_mean": 5.2, "accepted_add_mm_mean": 1.0, "accepted_add_below_3mm": 0.98, "accepted_of_true": 0.1}
     rows = figures_of_model({"validation": values})
-    assert verdict(rows, Limits()) == (False, ("20 % of views accepted, at least 30 % wanted",))
+    assert verdict(rows, Limits()) == (False, ("10 % of views accepted, at least 20 % wanted",))
     assert verdict(figures_of_model({"validation": values | {"accepted_of_true": 0.4}}), Limits()) == (True, ())
     assert verdict([], Limits()) is None
     nothing_shown = {"accepted_of_true": 0.0, "accepted_add_mm_mean": None, "accepted_add_below_3mm": None}
@@ -366,7 +366,7 @@ def test_reader_sees_what_changes_and_reads_meshes_once(case):
     )
     recorded = reader.recorded(folder, "surface", Limits())
     assert recorded.model
-    assert recorded.verdict == (False, ("an unknown share of views accepted, at least 30 % wanted",))
+    assert recorded.verdict == (False, ("an unknown share of views accepted, at least 20 % wanted",))
     files.write_json(case.folder / "study" / "study.json", study() | {"inputs": {"appearances_sha256": "b"}})
     assert reader.recorded(folder, "surface", Limits()).validation == "stale"
     (case.folder / "vessels.vtp").write_text("other")

@@ -23,7 +23,7 @@ class Limits:
 
     add_mm: float = 1.5
     right_min: float = 0.97
-    accepted_min: float = 0.3
+    accepted_min: float = 0.2
 
 
 @dataclass(frozen=True)
