@@ -49,6 +49,7 @@ class LayoutSection:
             node.SetBoxVisible(False)
             node.SetAxisLabelsVisible(False)
         ids = tuple(node.GetID() for node in (widget.mrmlSliceNode(), *shown_in))
+        _hide_slider(widget)
         self.views = live_views.LiveViews(widget.sliceLogic(), self._through, self._depth, ids)
         self._overview_of = None
         self._restrict_slice(widget.mrmlSliceNode())
@@ -102,6 +103,7 @@ class LayoutSection:
         widget = manager.sliceWidget(live_views.MRI)
         if widget is None:
             return False
+        _hide_slider(widget)
         composite = widget.sliceLogic().GetSliceCompositeNode()
         composite.SetForegroundVolumeID(None)
         composite.SetLabelVolumeID(None)
@@ -146,3 +148,9 @@ class LayoutSection:
             if widget.mrmlViewNode() is not None and widget.mrmlViewNode().GetSingletonTag() == name:
                 return widget
         return None
+
+
+def _hide_slider(slice_widget) -> None:
+    """The plane is the pose's. With each plane the slider's number changes its width, and Slicer lays out and draws all
+    views anew for that, 40 ms and more."""
+    slice_widget.sliceController().sliceOffsetSlider().hide()

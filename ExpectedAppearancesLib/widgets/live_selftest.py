@@ -13,6 +13,7 @@ import slicer
 from ..evaluation.metrics import add_mm
 from ..live.alignment import nudged
 from ..live.trust import Sight
+from ..mrml import live_views
 from ..mrml.live_record import frame_at
 from ..runs import dependencies
 from . import live_texts
@@ -49,6 +50,9 @@ def follows_frames_and_gives_the_layout_back(test) -> None:
                 predicted = status.result.prediction.camera_from_world
                 wrong.append(add_mm(phantom.case.vessels.vertices_mm, truth[None], predicted[None])[0])
             nodes.append(slicer.mrmlScene.GetNumberOfNodes())
+        manager = slicer.app.layoutManager()
+        if manager:
+            test.assertFalse(manager.sliceWidget(live_views.MICROSCOPE).sliceController().sliceOffsetSlider().visible)
         test.assertGreater(len(wrong), 15)
         test.assertLess(max(wrong), 0.5)
         test.assertEqual(nodes[5], nodes[-1])
