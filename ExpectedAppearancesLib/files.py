@@ -153,6 +153,10 @@ def read_label_map(path: Path) -> np.ndarray:
         if np.ptp(labels[..., :3].astype(int), axis=2).any():
             raise InputError(f"{path}: label map is a colour image; save it as an 8-bit grey PNG with values 0, 1, 2.")
         labels = labels[..., 0]
+    if labels.max() > 255:  # 256 would be read as 0
+        raise InputError(
+            f"{path}: label map holds the value {labels.max()}; save it as an 8-bit grey PNG with values 0, 1, 2."
+        )
     return labels.astype(np.uint8)
 
 

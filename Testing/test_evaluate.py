@@ -184,6 +184,22 @@ def test_a_style_is_no_path(case, known, tmp_path):
     assert any(path.name.endswith("_left_right_1.png") for path in made)
 
 
+def test_styles_with_dollar_signs_are_drawn_as_they_are_called(case, known, tmp_path):
+    """They were taken for formulas, and a bad one ended the evaluation when all was registered."""
+    camera, frames = read_poses(known)
+    write_poses(known, camera, [f.to_dict() | {"style": style} for f, style in zip(frames, ["$5 $x_", r"$\no$"] * 3)])
+    evaluate(case, known, tmp_path / "out", predicted_path=known)
+    assert (tmp_path / "out" / "styles.png").is_file()
+
+
+def test_only_overlays_of_an_earlier_run_are_removed(case, known, tmp_path):
+    folder = tmp_path / "out" / "overlays"
+    for name in ("00_day_0.png", "11_night_9.png", "brain.png"):
+        files.write_png(folder / name, np.zeros((4, 4, 3), np.uint8))
+    evaluate(case, known, tmp_path / "out", predicted_path=known)
+    assert (folder / "brain.png").is_file() and not (folder / "11_night_9.png").exists()
+
+
 def test_all_problems_at_once_and_nothing_written(case, known, tmp_path):
     images = [frame.image for frame in read_poses(known)[1]]
     images[0].unlink()

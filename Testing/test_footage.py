@@ -171,6 +171,15 @@ def test_register_without_track_is_as_before(case, video, tmp_path):
     assert "tracking" not in first and first["image"] == "Op ä.avi#frame=0" and first["time_s"] == 0
 
 
+def test_register_says_that_a_video_is_cut_short(case, video, tmp_path, capsys):
+    cut = tmp_path / "cut.avi"
+    cut.write_bytes(video.read_bytes()[: video.stat().st_size * 3 // 4])
+    for path, said in ((video, False), (cut, True)):
+        argv = ["register", str(case.folder), str(path), "--fps", "12.5", "--out", str(tmp_path / "poses.json")]
+        assert main(argv) == 0
+        assert ("of its 20 frames could be read" in capsys.readouterr().out) == said, path
+
+
 def test_register_says_before_it_begins_that_its_file_cannot_be_written(case, video, tmp_path, capsys, monkeypatch):
     """After an hour's video its poses would be lost."""
     monkeypatch.setattr(SteadyPredictor, "predict", lambda *_: pytest.fail("registered for nothing"))

@@ -376,10 +376,25 @@ def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
 
 def test_all_problems_at_once_and_nothing_trained(studied, tmp_path, capsys):
     argv = ["study", str(studied.case), "--poses", str(studied.poses), "--out", str(studied.out)]
-    wrong = ["--protocols", "lotto", "--preset", "fast", "--steps", "0", "--styles", "z", "--executor", "ray://x"]
+    wrong = [
+        "--protocols",
+        "lotto",
+        "--preset",
+        "fast",
+        "--steps",
+        "0",
+        "--seed",
+        "-2",
+        "--styles",
+        "z",
+        "--executor",
+        "ray://x",
+    ]
     assert main([*argv, *wrong, "--textures-study"]) == 2
     text = capsys.readouterr().err
-    assert all(word in text for word in ("'lotto'", "'fast'", "--steps: 0", "'z'", "ray://x", "at least 6"))
+    assert all(
+        word in text for word in ("'lotto'", "'fast'", "--steps: 0", "--seed: -2", "'z'", "ray://x", "at least 6")
+    )
     assert main([*argv[:3], str(studied.poses), str(studied.poses), *argv[4:]]) == 2
     assert "2 files for 1 case" in capsys.readouterr().err
     assert not calls(studied) and not studied.out.exists()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -78,6 +79,8 @@ def test_reports_all_problems_at_once_with_the_file_of_each(tmp_path):
     add(tmp_path, "size", labels=label_map(32))
     add(tmp_path, "few", labels=few)
     add(tmp_path, "foreign", labels=foreign)
+    files.write_png(tmp_path / "deep.png", photo())
+    cv2.imwrite(str(tmp_path / "deep.labels.png"), label_map().astype(np.uint16) * 256)
     add(tmp_path, "damaged")
     (tmp_path / "damaged.png").write_bytes((tmp_path / "damaged.png").read_bytes()[:20])
     with pytest.raises(InputError) as error:
@@ -88,6 +91,7 @@ def test_reports_all_problems_at_once_with_the_file_of_each(tmp_path):
         "size.png": "64 x 64 px but",
         "few.labels.png": "only 100 px of vessels",
         "foreign.labels.png": "value(s) 7",
+        "deep.labels.png": "holds the value 512",
         "damaged.png": "not an image",
     }
     assert len(error.value.problems) == len(expected)

@@ -79,6 +79,8 @@ def run(args, progress) -> None:
         total = max(footage.count, i + 1)
         progress((i + 1) / total, f"frame {i + 1} of {total}")
     problems.raise_if_any()
+    if footage.is_video and len(frames) < 0.99 * footage.count - 1:  # files may count a frame too many
+        print(f"{args.images[0]}: only {len(frames)} of its {footage.count} frames could be read; is it cut short?")
     write_poses(args.out, camera, frames, case.vessels_sha256)
     accepted = sum(frame["accepted"] for frame in frames)
     print(f"{accepted} of {len(frames)} frames accepted. Poses: {args.out}")

@@ -66,6 +66,8 @@ def run(args, progress) -> None:
         value = getattr(args, name)
         if value is not None and value <= 0:
             problems.add(f"--{name}: {value}; it must be above 0.")
+    if args.seed < 0:
+        problems.add(f"--seed: {args.seed}; give 0 or more.")
     if args.model_folder is None and (args.exclude or args.poses or args.no_inner_texture):
         problems.add("--model-folder: missing; --exclude, --poses and --no-inner-texture make no model for use.")
     problems.raise_if_any()

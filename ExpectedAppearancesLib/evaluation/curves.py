@@ -11,6 +11,7 @@ import numpy as np
 from .. import files
 from .metrics import ADD_RANGE_MM, FrameErrors, accuracy, add_accuracy, add_auc
 
+LONGEST_NAME = 40  # characters beside the bars
 _ALL, _ACCEPTED, _STYLE, _SECOND = "#1f4e99", "#2a9d5c", "#9aa5b1", "#e08a2e"
 
 
@@ -91,7 +92,8 @@ def write_style_bars(path: Path, metrics: dict) -> None:
         axes.set(xlabel=x_label, xlim=(0, 112 if scale == 100 else axes.get_xlim()[1] * 1.1))
         axes.grid(axis="x", alpha=0.3)
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
-    left.set_yticks(rows, list(styles))
+    # A style is any text of a poses.json.
+    left.set_yticks(rows, [name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…" for name in styles])
     left.set_ylabel("style")
     left.invert_yaxis()
     write_figure(path, figure)
@@ -112,6 +114,10 @@ def new_figure(width_inch: float, height_inch: float):
 
 
 def write_figure(path: Path, figure) -> None:
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # names of textures and folders may hold dollar signs
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     files.write_bytes(path, buffer.getvalue())

@@ -208,7 +208,7 @@ def _write_overlays(case: Case, evaluation: Evaluation, folder: Path) -> None:
     from .overlays import choose_frames, sheet
 
     chosen = choose_frames(evaluation.errors.add_mm, evaluation.styles, OVERLAY_COUNT)
-    for old in (folder / "overlays").glob("*.png"):
+    for old in (folder / "overlays").glob("[0-9][0-9]_*.png"):
         old.unlink()  # of an earlier run: they would pass for this one's
     tiles = []
     for rank, (index, tile) in enumerate(zip(chosen, overlay_images(case, evaluation, chosen))):

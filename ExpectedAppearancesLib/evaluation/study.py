@@ -141,6 +141,8 @@ def _check(pairs, out_folder: Path, settings: StudySettings, progress: ProgressF
     for name, value in (("steps", settings.steps), ("minutes", settings.minutes)):
         if value is not None and value <= 0:
             problems.add(f"--{name}: {value}; it must be above 0.")
+    if settings.seed < 0:
+        problems.add(f"--seed: {settings.seed}; give 0 or more.")
     for word, count in (("robustness-frames", settings.robustness_frames), ("frames", settings.frames)):
         if count < 1:
             problems.add(f"--{word}: {count}; give at least 1.")

@@ -92,7 +92,8 @@ class PoseSampler:
                 return pose
         raise InputError(
             f"poses: in {MAX_TRIES} tries no view held {self.ranges.in_view_min:.0%} of the vessels; check that "
-            "vessels and camera belong together, or choose a larger working distance or a smaller lateral offset."
+            "vessels, camera and centre of the craniotomy belong together, or choose a larger working distance or a "
+            "smaller lateral offset."
         )
 
     def share_in_view(self, camera_from_world: np.ndarray) -> float:
