@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from .. import __version__, files
@@ -39,6 +39,8 @@ for research only, not a medical device</p>
 2023, whose training and test images share their poses; it measures memory of poses too.
 Epoch and threshold for refusal are chosen on synthesised views of an inner split, never on the texture left out.</p>
 {{ figures(all_rows, "case, model, protocol") }}
+{% for text in trainings %}<p class="note">{{ text }}</p>
+{% endfor %}
 {% for name, nearest, mean in baselines %}<p class="note">{{ name }}: always answering the mean pose of these
 frames gives ADD {{ mean }} mm; answering the nearest other pose of the frames, chosen knowing the truth,
 {{ nearest }} mm.</p>
@@ -107,6 +109,7 @@ def write_study_report(folder: Path, studies: Sequence[tuple[Path, dict]]) -> No
         version=__version__,
         headings=[(name, unit) for name, unit, *_ in COLUMNS],
         all_rows=[row for label, (_, entry) in entries.items() for row in _total_rows(label, entry)],
+        trainings=[f"{label}: trained for {_steps(entry['folds'].values())}." for label, (_, entry) in entries.items()],
         baselines=[row for name, (_, study) in zip(names, studies) for row in _baselines(name, study)],
         per_style=[
             (label, [(style, cells(values)) for style, values in entry["per_style"].items()])
@@ -218,7 +221,11 @@ def _left_out_text(name: str, study: dict, several: bool) -> str:
     start = f"{name}: tested" if several else "Tested"
     text = f"{start} on frames of {', '.join(study['left_out'])}, which no model ({study['preset']}) was trained on"
     # Time may end a training before its steps do.
-    steps = [row["training"]["steps"] for row in study["rows"]]
-    if min(steps) == max(steps):
-        return f"{text}; all were trained for {steps[0]} steps."
-    return f"{text}. Trainings took {min(steps)} to {max(steps)} steps, so models differ in more than their textures."
+    steps = _steps([row["training"] for row in study["rows"]])
+    differ = ", so models differ in more than their textures" if " to " in steps else ""
+    return f"{text}; they were trained for {steps}{differ}."
+
+
+def _steps(trainings: Iterable[dict]) -> str:
+    steps = sorted({training["steps"] for training in trainings})
+    return f"{steps[0]} steps" if len(steps) == 1 else f"{steps[0]} to {steps[-1]} steps"
