@@ -20,6 +20,30 @@ for scene in range(2):
     )
 
 
+def test_a_camera_file_that_is_taken_out_again_is_not_used():
+    """Slicer's field says nothing of an emptied path: the field was empty, and frames went on with that calibration."""
+    in_the_live_panel(
+        """
+class PathEdit(MagicMock):
+    def type(self, text):
+        for signal, slot in [call.args for call in self.line.connect.call_args_list + self.connect.call_args_list]:
+            if signal.startswith("textChanged") or text.endswith(".json"):
+                slot(text)
+
+ui = MagicMock()
+for name in ("case", "source", "camera"):
+    edit = PathEdit()
+    edit.line = edit.findChild.return_value = MagicMock()
+    setattr(ui, f"{name}PathLineEdit", edit)
+panel = LivePanel(ui, controller)
+panel.set_parameter_node(parameter_node())
+for path in ("other.json", ""):
+    ui.cameraPathLineEdit.type(path)
+    assert panel.source.choice().camera_path == path
+"""
+    )
+
+
 def test_parameters_are_bound_once_and_looked_at_at_each_visit(tmp_path):
     """Slicer 5.8 never ends what was bound: after some dozens of visits each change took the panel tens of ms."""
     in_the_live_panel(
