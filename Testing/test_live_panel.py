@@ -69,6 +69,25 @@ assert node.connectGui.call_count == 1
     )
 
 
+def test_numbers_are_those_of_what_is_seen():
+    """100 % stood under a lost source, and the age of a blank frame under the picture of long before it."""
+    in_the_live_panel(
+        """
+from types import SimpleNamespace
+from ExpectedAppearancesLib.live.status import Status
+from ExpectedAppearancesLib.live.trust import Sight, Verdict
+ui = panel.ui
+def numbers(sight, picture=True):
+    result = SimpleNamespace(prediction=SimpleNamespace(confidence=0.99), image_rgb=picture or None, latency_ms=20.0)
+    panel.status.show(Status(Verdict(sight, 0.2), result))
+    return ui.confidenceLabel.text, ui.ageLabel.text
+assert numbers(Sight.FOLLOWING) == ("99 %", "200 ms")
+assert numbers(Sight.STALE) == numbers(Sight.LOST) == ("–", "200 ms")
+assert numbers(Sight.UNUSABLE, picture=False)[1] == "–"
+"""
+    )
+
+
 def test_why_the_sample_cannot_be_made_is_said_in_the_panel(tmp_path):
     in_the_live_panel(
         """

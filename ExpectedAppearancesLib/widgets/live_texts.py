@@ -29,7 +29,7 @@ def _headlines() -> dict[Sight, str]:
         Sight.LOADING: _("LOADING THE CASE"),
         Sight.WAITING: _("WAITING FOR A PICTURE"),
         Sight.LOST: _("NO PICTURE: source lost"),
-        Sight.UNUSABLE: _("NO OVERLAY: frame unusable"),
+        Sight.UNUSABLE: _("NO PICTURE: frame unusable"),
         Sight.OTHER_CASE: _("NO OVERLAY: another patient's case"),
         Sight.FAILED: _("NO OVERLAY: registration failed"),
         Sight.STALE: _("NO OVERLAY: frame too old"),
