@@ -88,6 +88,21 @@ assert numbers(Sight.UNUSABLE, picture=False)[1] == "–"
     )
 
 
+def test_a_new_choice_is_not_judged_by_the_message_about_the_one_before():
+    """Start was disabled, and the panel told why another file could not be read."""
+    in_the_live_panel(
+        """
+panel._missing = ""
+panel.say("other.json: damaged")
+panel.refresh()
+assert "damaged" in panel.ui.problemLabel.text
+panel.parameters().sourceKind, panel.parameters().device = "device", ""
+panel.refresh()
+assert "capture device" in panel.ui.problemLabel.text, panel.ui.problemLabel.text
+"""
+    )
+
+
 def test_why_the_sample_cannot_be_made_is_said_in_the_panel(tmp_path):
     in_the_live_panel(
         """
