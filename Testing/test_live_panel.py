@@ -88,6 +88,18 @@ assert numbers(Sight.UNUSABLE, picture=False)[1] == "–"
     )
 
 
+def test_a_message_is_seen_where_the_panel_is_scrolled_down():
+    """On a small screen Export seemed to do nothing: what was missing stood above what is seen."""
+    in_the_live_panel(
+        """
+slicer.util = MagicMock()
+panel.record._ui.exportPathLineEdit.currentPath = ""
+panel.record._on_export()
+slicer.util.showStatusMessage.assert_called_with("Choose a folder for the export.")
+"""
+    )
+
+
 def test_a_new_choice_is_not_judged_by_the_message_about_the_one_before():
     """Start was disabled, and the panel told why another file could not be read."""
     in_the_live_panel(

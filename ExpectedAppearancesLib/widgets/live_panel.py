@@ -150,6 +150,7 @@ class LivePanel:
         self._message = text
         self.ui.problemLabel.setStyleSheet(DONE_STYLE if done else PROBLEM_STYLE)
         self._show_problem()
+        slicer.util.showStatusMessage(text)  # where the panel is scrolled down the label is not seen
 
     def show_views(self) -> None:
         if slicer.app.layoutManager() is not None:
