@@ -100,6 +100,20 @@ slicer.util.showStatusMessage.assert_called_with("Choose a folder for the export
     )
 
 
+def test_a_recorded_frame_that_was_refused_is_not_taken_for_a_live_one():
+    in_the_live_panel(
+        """
+from types import SimpleNamespace
+from ExpectedAppearancesLib.live.status import Status
+from ExpectedAppearancesLib.live.trust import Sight, Verdict
+from ExpectedAppearancesLib.widgets import live_texts
+for picture, words in ((None, "A recorded frame, not live"), (True, "Clear the view")):
+    result = SimpleNamespace(image_rgb=picture, steadied=None)
+    assert words in live_texts.detail(Status(Verdict(Sight.REFUSED), result))
+"""
+    )
+
+
 def test_a_new_choice_is_not_judged_by_the_message_about_the_one_before():
     """Start was disabled, and the panel told why another file could not be read."""
     in_the_live_panel(
