@@ -44,6 +44,20 @@ for path in ("other.json", ""):
     )
 
 
+def test_a_volume_that_leaves_the_scene_for_a_while_is_not_replaced_by_another():
+    """Slicer's list then takes any other volume: the next start was on the scan, or on the panel's own picture."""
+    in_the_live_panel(
+        """
+stream, scan = MagicMock(), MagicMock()
+p = panel.parameters()
+for running, chosen in ((False, stream), (True, scan)):
+    panel.source.refresh(running)
+    panel.source._on_node(chosen)
+    assert p.sourceNode is stream
+"""
+    )
+
+
 def test_parameters_are_bound_once_and_looked_at_at_each_visit(tmp_path):
     """Slicer 5.8 never ends what was bound: after some dozens of visits each change took the panel tens of ms."""
     in_the_live_panel(

@@ -78,6 +78,8 @@ class SourceSection:
 
     def _on_node(self, node) -> None:
         p = self._parameters()
+        if not self._ui.sourceNodeComboBox.enabled:  # it runs: where its volume left the scene Slicer takes any other
+            return
         if p is not None and p.sourceNode is not node:
             p.sourceNode = node
             self._changed()
