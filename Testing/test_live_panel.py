@@ -20,6 +20,44 @@ for scene in range(2):
     )
 
 
+def test_a_camera_file_that_is_taken_out_again_is_not_used():
+    """Slicer's field says nothing of an emptied path: the field was empty, and frames went on with that calibration."""
+    in_the_live_panel(
+        """
+class PathEdit(MagicMock):
+    def type(self, text):
+        for signal, slot in [call.args for call in self.line.connect.call_args_list + self.connect.call_args_list]:
+            if signal.startswith("textChanged") or text.endswith(".json"):
+                slot(text)
+
+ui = MagicMock()
+for name in ("case", "source", "camera"):
+    edit = PathEdit()
+    edit.line = edit.findChild.return_value = MagicMock()
+    setattr(ui, f"{name}PathLineEdit", edit)
+panel = LivePanel(ui, controller)
+panel.set_parameter_node(parameter_node())
+for path in ("other.json", ""):
+    ui.cameraPathLineEdit.type(path)
+    assert panel.source.choice().camera_path == path
+"""
+    )
+
+
+def test_a_volume_that_leaves_the_scene_for_a_while_is_not_replaced_by_another():
+    """Slicer's list then takes any other volume: the next start was on the scan, or on the panel's own picture."""
+    in_the_live_panel(
+        """
+stream, scan = MagicMock(), MagicMock()
+p = panel.parameters()
+for running, chosen in ((False, stream), (True, scan)):
+    panel.source.refresh(running)
+    panel.source._on_node(chosen)
+    assert p.sourceNode is stream
+"""
+    )
+
+
 def test_parameters_are_bound_once_and_looked_at_at_each_visit(tmp_path):
     """Slicer 5.8 never ends what was bound: after some dozens of visits each change took the panel tens of ms."""
     in_the_live_panel(
@@ -42,6 +80,66 @@ for _visit in range(3):
 assert node.connectGui.call_count == 1
 """,
         tmp_path,
+    )
+
+
+def test_numbers_are_those_of_what_is_seen():
+    """100 % stood under a lost source, and the age of a blank frame under the picture of long before it."""
+    in_the_live_panel(
+        """
+from types import SimpleNamespace
+from ExpectedAppearancesLib.live.status import Status
+from ExpectedAppearancesLib.live.trust import Sight, Verdict
+ui = panel.ui
+def numbers(sight, picture=True):
+    result = SimpleNamespace(prediction=SimpleNamespace(confidence=0.99), image_rgb=picture or None, latency_ms=20.0)
+    panel.status.show(Status(Verdict(sight, 0.2), result))
+    return ui.confidenceLabel.text, ui.ageLabel.text
+assert numbers(Sight.FOLLOWING) == ("99 %", "200 ms")
+assert numbers(Sight.STALE) == numbers(Sight.LOST) == ("–", "200 ms")
+assert numbers(Sight.UNUSABLE, picture=False)[1] == "–"
+"""
+    )
+
+
+def test_a_message_is_seen_where_the_panel_is_scrolled_down():
+    """On a small screen Export seemed to do nothing: what was missing stood above what is seen."""
+    in_the_live_panel(
+        """
+slicer.util = MagicMock()
+panel.record._ui.exportPathLineEdit.currentPath = ""
+panel.record._on_export()
+slicer.util.showStatusMessage.assert_called_with("Choose a folder for the export.")
+"""
+    )
+
+
+def test_a_recorded_frame_that_was_refused_is_not_taken_for_a_live_one():
+    in_the_live_panel(
+        """
+from types import SimpleNamespace
+from ExpectedAppearancesLib.live.status import Status
+from ExpectedAppearancesLib.live.trust import Sight, Verdict
+from ExpectedAppearancesLib.widgets import live_texts
+for picture, words in ((None, "A recorded frame, not live"), (True, "Clear the view")):
+    result = SimpleNamespace(image_rgb=picture, steadied=None)
+    assert words in live_texts.detail(Status(Verdict(Sight.REFUSED), result))
+"""
+    )
+
+
+def test_a_new_choice_is_not_judged_by_the_message_about_the_one_before():
+    """Start was disabled, and the panel told why another file could not be read."""
+    in_the_live_panel(
+        """
+panel._missing = ""
+panel.say("other.json: damaged")
+panel.refresh()
+assert "damaged" in panel.ui.problemLabel.text
+panel.parameters().sourceKind, panel.parameters().device = "device", ""
+panel.refresh()
+assert "capture device" in panel.ui.problemLabel.text, panel.ui.problemLabel.text
+"""
     )
 
 

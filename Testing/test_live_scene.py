@@ -288,6 +288,8 @@ def test_view_through_the_camera_has_the_frame_behind_the_vessels(application, c
 
 
 def test_banner_is_read_over_the_view_and_goes_without_a_trace(application, case):
+    from vtkmodules.vtkRenderingCore import vtkActor2D
+
     from ExpectedAppearancesLib.mrml.live_banner import Banner
 
     view, _live, _result = shown(application, case)
@@ -300,6 +302,9 @@ def test_banner_is_read_over_the_view_and_goes_without_a_trace(application, case
     assert red[2].all() and red[-3].all() and red[:, 2].all() and red[:, -3].all()
     assert (pixels[8:60] > 200).all(axis=2).any()  # white letters
     np.testing.assert_array_equal(pixels[80:400, 20:620], before[80:400, 20:620])
+    view.renderer.AddViewProp(vtkActor2D())  # as an outline that is drawn for the first time, across the words
+    assert banner.say("NO OVERLAY", (0.75, 0.08, 0.1)) and not banner.say("NO OVERLAY", (0.75, 0.08, 0.1))
+    assert view.renderer.GetViewProps().GetLastProp().IsA("vtkTextActor")
     banner.remove()
     np.testing.assert_array_equal(view.pixels(), before)
 

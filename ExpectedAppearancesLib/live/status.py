@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +27,9 @@ class Status:
 
     @property
     def confidence(self) -> float | None:
-        """Of the pose on the screen; None where there is none, or where its file did not say."""
-        known = self.result is not None and self.result.prediction is not None
+        """Of the pose on the screen; None where there is none, where it is of the past, or its file did not say."""
+        past = self.verdict.sight in (Sight.STALE, Sight.LOST)
+        known = not past and self.result is not None and self.result.prediction is not None
         return self.result.prediction.confidence if known and np.isfinite(self.result.prediction.confidence) else None
 
     @property
@@ -35,6 +37,12 @@ class Status:
         if self.result is None or self.result.image_rgb is None or not np.isfinite(self.result.latency_ms):
             return None
         return self.result.latency_ms
+
+    @property
+    def age_s(self) -> float:
+        """Of the picture on the screen; NaN where the newest frame gave none, and an earlier one is still there."""
+        has_none = self.result is not None and self.result.image_rgb is None
+        return math.nan if has_none else self.verdict.age_s
 
 
 IDLE = Status(Verdict(Sight.IDLE))

@@ -38,13 +38,16 @@ class Banner:
         self._edge = vtk.vtkActor2D()
         self._edge.SetMapper(mapper)
         self._edge.GetProperty().SetLineWidth(2 * EDGE_PX)
-        for actor in (self._edge, self._text):
-            renderer.AddViewProp(actor)
+        self._put_on_top()
         self._said: tuple | None = None
 
     def say(self, text: str, rgb: tuple[float, float, float]) -> bool:
         """Show text (may be '') on the colour. True when that changed, and the view must be drawn again."""
-        if self._said == (text, rgb):
+        on_top = self._renderer.GetViewProps().GetLastProp() is self._text
+        if not on_top:  # outlines came to the view since, and are drawn across the words
+            self.remove()
+            self._put_on_top()
+        if on_top and self._said == (text, rgb):
             return False
         self._said = (text, rgb)
         self._text.SetInput(text or " ")
@@ -52,6 +55,10 @@ class Banner:
         self._text.GetTextProperty().SetBackgroundColor(*rgb)
         self._edge.GetProperty().SetColor(*rgb)
         return True
+
+    def _put_on_top(self) -> None:
+        for actor in (self._edge, self._text):
+            self._renderer.AddViewProp(actor)
 
     def remove(self) -> None:
         for actor in (self._edge, self._text):

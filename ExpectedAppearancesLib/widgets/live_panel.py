@@ -42,6 +42,7 @@ class LivePanel:
         self._parameter_node = None
         self._gui_tag = None
         self._message = ""
+        self._choice = None  # that the message is about
         self._problem = ""
         self._starting = False
         self._missing = live_install.problem()
@@ -126,6 +127,10 @@ class LivePanel:
         if self._missing:
             self._missing = live_install.problem()
         self._problem = self._missing or self.source.problem()
+        choice = self.source.choice()
+        if choice != self._choice:  # what was wrong with the one before would hide what is wrong with this one
+            self._choice = choice
+            self.say("")
         self.ui.installButton.visible = bool(self._missing)
         self.controller.set_stale(p.staleMs / 1000)
         try:
@@ -145,6 +150,7 @@ class LivePanel:
         self._message = text
         self.ui.problemLabel.setStyleSheet(DONE_STYLE if done else PROBLEM_STYLE)
         self._show_problem()
+        slicer.util.showStatusMessage(text)  # where the panel is scrolled down the label is not seen
 
     def show_views(self) -> None:
         if slicer.app.layoutManager() is not None:

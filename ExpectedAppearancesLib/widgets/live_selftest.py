@@ -31,6 +31,9 @@ def says_what_is_missing(test) -> None:
     p.casePath = slicer.app.temporaryPath
     if not dependencies.missing("registration"):
         test.assertIn("case.json", widget.ui.problemLabel.text)
+    for path in ("/another/camera.json", "/another/camera.txt", ""):  # what the field holds is what is taken
+        widget.ui.cameraPathLineEdit.currentPath = path
+        test.assertEqual(p.cameraPath, path)
 
 
 def follows_frames_and_gives_the_layout_back(test) -> None:

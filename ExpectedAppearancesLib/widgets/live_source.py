@@ -16,7 +16,9 @@ class SourceSection:
         self._paths = {"casePath": ui.casePathLineEdit, "sourcePath": ui.sourcePathLineEdit}
         self._paths["cameraPath"] = ui.cameraPathLineEdit
         for name, edit in self._paths.items():
-            edit.connect("currentPathChanged(QString)", lambda path, n=name: self._on_path(n, path))
+            # Its own signal is not sent for a path that is emptied, nor for another kind of file than it asks for.
+            text = edit.findChild("QLineEdit")
+            text.connect("textChanged(QString)", lambda path, n=name: self._on_path(n, path))
         # Slicer's own binding allows one class of node only, and no abstract one.
         ui.sourceNodeComboBox.connect("currentNodeChanged(vtkMRMLNode*)", self._on_node)
         ui.kindComboBox.connect("currentIndexChanged(int)", self._on_kind)
@@ -49,9 +51,7 @@ class SourceSection:
             return
         for name, edit in self._paths.items():
             if edit.currentPath != getattr(p, name):
-                was_blocked = edit.blockSignals(True)
                 edit.currentPath = getattr(p, name)
-                edit.blockSignals(was_blocked)
         if ui.sourceNodeComboBox.currentNode() is not p.sourceNode:
             ui.sourceNodeComboBox.setCurrentNode(p.sourceNode)
         kind = SourceKind(p.sourceKind)
@@ -78,6 +78,8 @@ class SourceSection:
 
     def _on_node(self, node) -> None:
         p = self._parameters()
+        if not self._ui.sourceNodeComboBox.enabled:  # it runs: where its volume left the scene Slicer takes any other
+            return
         if p is not None and p.sourceNode is not node:
             p.sourceNode = node
             self._changed()

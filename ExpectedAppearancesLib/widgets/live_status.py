@@ -42,7 +42,7 @@ class StatusSection:
         set_percent(ui.confidenceBar, 0 if confidence is None else round(100 * confidence))
         latency_ms = status.latency_ms
         set_text(ui.latencyLabel, "–" if latency_ms is None else f"{latency_ms:.0f} ms")
-        set_text(ui.ageLabel, live_texts.age(status.verdict.age_s))
+        set_text(ui.ageLabel, live_texts.age(status.age_s))
         set_text(ui.droppedLabel, str(status.dropped))
         set_text(ui.modelLabel, self._origin(status))
 

@@ -29,7 +29,7 @@ def _headlines() -> dict[Sight, str]:
         Sight.LOADING: _("LOADING THE CASE"),
         Sight.WAITING: _("WAITING FOR A PICTURE"),
         Sight.LOST: _("NO PICTURE: source lost"),
-        Sight.UNUSABLE: _("NO OVERLAY: frame unusable"),
+        Sight.UNUSABLE: _("NO PICTURE: frame unusable"),
         Sight.OTHER_CASE: _("NO OVERLAY: another patient's case"),
         Sight.FAILED: _("NO OVERLAY: registration failed"),
         Sight.STALE: _("NO OVERLAY: frame too old"),
@@ -70,8 +70,11 @@ def detail(status: Status) -> str:
         return _("{error}. Stop and start again; if it returns, send Slicer's log.").format(error=verdict.detail)
     if verdict.detail:
         return verdict.detail
-    if verdict.sight is Sight.FROZEN and status.result is not None and status.result.image_rgb is None:
+    recorded = status.result is not None and status.result.image_rgb is None
+    if recorded and verdict.sight is Sight.FROZEN:
         return _("A recorded frame, with the pose that it had.")
+    if recorded and verdict.sight is Sight.REFUSED:
+        return _("A recorded frame, not live: its pose was refused.")
     if verdict.sight is Sight.REFUSED and _disagrees(status.result):
         return _("This frame's pose does not fit those before it, so it is not shown.")
     return _details().get(verdict.sight, "")

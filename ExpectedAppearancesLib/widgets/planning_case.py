@@ -263,7 +263,8 @@ class MicroscopeSection(Section):
     title = "Microscope"
 
     def setup(self) -> None:
-        self.ui.calibrationPathEdit.connect("currentPathChanged(QString)", self.on_path)
+        # Its own signal is not sent for a path that is emptied, nor for another kind of file than it asks for.
+        self.ui.calibrationPathEdit.findChild("QLineEdit").connect("textChanged(QString)", self.on_path)
 
     def refresh(self) -> None:
         p = self.parameters
@@ -271,8 +272,7 @@ class MicroscopeSection(Section):
         self.ui.calibrationRow.visible = from_file
         self.ui.viewRow.visible = not from_file
         if self.ui.calibrationPathEdit.currentPath != p.calibrationPath:
-            with quiet(self.ui.calibrationPathEdit):
-                self.ui.calibrationPathEdit.currentPath = p.calibrationPath
+            self.ui.calibrationPathEdit.currentPath = p.calibrationPath
         try:
             camera = self.session.camera(p)
         except InputError:

@@ -157,6 +157,8 @@ def test_microscope_from_file_or_view(test) -> None:
         panel.ui.calibrationPathEdit.currentPath = str(folder / "camera.json")
         wait_until(test, lambda: panel.steps["microscope"].state is StepState.MISSING)
         test.assertIn("camera.json", panel.steps["microscope"].text)
+        panel.ui.calibrationPathEdit.currentPath = ""
+        test.assertEqual(p.calibrationPath, "")
 
 
 def test_cameras_follow_the_sliders(test) -> None:
