@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import torch
 
-from ..textures.library import CLASS_NAMES, Texture
+from ..masks.labels import TISSUES
+from ..textures.library import Texture
 from .images import resized, to_vgg_input
 from .vgg import VggFeatures
 
 # Background has none: the field outside the craniotomy stays black, as in a masked frame.
-CLASSES = tuple(CLASS_NAMES)
+CLASSES = TISSUES
 
 # A Gram matrix is summed over so many pixels in the compute type, and over these sums in fp32: bf16 loses nothing
 # that matters, and the order of the additions depends neither on the batch nor on the number of threads.

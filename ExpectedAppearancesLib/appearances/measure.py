@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ..textures.library import CLASS_NAMES, Texture
+from ..masks.labels import CLASS_NAMES
+from ..textures.library import Texture
 from .gram import CLASSES, ClassTerm, TargetGrams, class_masks, rows_of
 from .images import to_vgg_input
 from .vgg import VggFeatures

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
+from ..masks.labels import PARENCHYMA, VESSELS
 from . import painting
-from .library import LABELS_SUFFIX, PARENCHYMA, VESSELS, Texture
+from .library import LABELS_SUFFIX, Texture
 from .painting import Palette
 
 SIZE_PX = 512

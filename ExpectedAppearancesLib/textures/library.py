@@ -15,12 +15,11 @@ import numpy as np
 
 from .. import files
 from ..errors import InputError, Problems
+from ..masks.labels import BACKGROUND, CLASS_NAMES, PARENCHYMA, TISSUES, VESSELS
 
 LABELS_SUFFIX = ".labels.png"
 SHARED_LABELS = "labels.png"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-BACKGROUND, PARENCHYMA, VESSELS = 0, 1, 2
-CLASS_NAMES = {PARENCHYMA: "parenchyma", VESSELS: "vessels"}
 MINIMUM_CLASS_PX = 200  # below this a Gram matrix says more about the single pixels than about the tissue
 
 
@@ -39,10 +38,6 @@ class Texture:
     def sha256(self) -> str:
         """Of image and labels: what appearances made from the texture depend on."""
         return hashlib.sha256(self.image.tobytes() + self.labels.tobytes()).hexdigest()
-
-    def class_shares(self) -> dict[str, float]:
-        """Share of the pixels in each class, for listings."""
-        return {name: float((self.labels == label).mean()) for label, name in CLASS_NAMES.items()}
 
 
 def shipped_textures_folder() -> Path:
@@ -174,12 +169,12 @@ def check_texture(path: Path, image: np.ndarray, labels_path: Path, labels: np.n
             f"{labels_path}: holds the value(s) {shown}; "
             "only 0 (background), 1 (parenchyma) and 2 (vessels) are allowed."
         )
-    for label, class_name in CLASS_NAMES.items():
+    for label in TISSUES:
         count = int((labels == label).sum())
         if count < MINIMUM_CLASS_PX:
             found.append(
-                f"{labels_path}: only {count} px of {class_name} (value {label}), at least {MINIMUM_CLASS_PX} are "
-                "needed; label more of it, or leave this texture out."
+                f"{labels_path}: only {count} px of {CLASS_NAMES[label]} (value {label}), at least {MINIMUM_CLASS_PX} "
+                "are needed; label more of it, or leave this texture out."
             )
     return found
 

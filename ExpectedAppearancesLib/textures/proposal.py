@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .library import BACKGROUND, PARENCHYMA, VESSELS
+from ..masks.labels import BACKGROUND, PARENCHYMA, VESSELS
 
 WORKING_SIDE_PX = 512
 VESSEL_SIGMAS_PX = (5.0, 8.0, 12.0)  # half the width of the vessels that are looked for, at the working size

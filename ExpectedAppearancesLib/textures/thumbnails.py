@@ -14,7 +14,8 @@ import numpy as np
 
 from .. import files
 from ..errors import InputError
-from .library import VESSELS, read_texture
+from ..masks.labels import VESSELS
+from .library import read_texture
 
 WANTED, MADE = "wanted.json", "made.json"
 THUMBNAIL_PX = 84
