@@ -315,16 +315,6 @@ def test_few_frames_are_all_chosen():
     assert len(overlays.choose_frames(np.full(5, np.nan), ["a"] * 5, 12)) == 1
 
 
-def test_box_corners_are_the_projected_corners_and_nothing_behind_the_camera():
-    image = np.zeros((96, 96, 3), np.uint8)
-    vertices = np.array([(-5.0, -8.0, 90.0), (5.0, 8.0, 90.0), (0.0, 0.0, 100.0)])
-    drawn = overlays.draw_box(image, vertices, CAMERA, np.eye(4), (255, 0, 0))
-    rows, columns = np.nonzero(drawn[..., 0] > 128)
-    np.testing.assert_allclose((columns.min(), columns.max()), (47.5 - 10, 47.5 + 10), atol=1)
-    np.testing.assert_allclose((rows.min(), rows.max()), (47.5 - 16, 47.5 + 16), atol=1)
-    assert not overlays.draw_box(image, vertices - (0, 0, 95), CAMERA, np.eye(4), (255, 0, 0)).any()
-
-
 def test_undistorted_frame_shows_a_point_where_the_ideal_camera_sees_it():
     camera = Camera(96, 96, 180.0, 180.0, 47.5, 47.5, (-0.9, 0.0, 0.0, 0.0, 0.0))
     point = np.array([[16.0, -14.0, 80.0]])

@@ -49,9 +49,3 @@ def operations_per_evaluation(shape: tuple[int, int], backbone: str, class_share
             before = width
         operations += 2 * (2 * pixels * sum(class_shares) * width * width)
     return operations
-
-
-def operations_per_image(
-    shape: tuple[int, int], backbone: str, class_shares: tuple[float, ...], iterations: int
-) -> float:
-    return operations_per_evaluation(shape, backbone, class_shares) * (iterations + 1)

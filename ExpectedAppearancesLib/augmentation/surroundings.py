@@ -14,7 +14,7 @@ import numpy as np
 OPENING = 0.6  # share of views in which the craniotomy hides part of the surface; in the others tissue goes on
 WIDEST = 0.12  # of the image's side: how far it goes on at most beyond the mesh's rim
 EVERYWHERE = 0.2  # share of those in which it fills what it can reach
-BLACK, CORTEX, DRAPE = 0.4, 0.25, 0.35  # shares of what is seen outside
+BLACK, CORTEX = 0.4, 0.25  # shares of what is seen outside; the rest is cloth
 
 
 def opening(where_px: np.ndarray, centre_px: np.ndarray, extent_px: float, rng) -> np.ndarray | None:

@@ -70,10 +70,6 @@ class Case:
     def model_folder(self) -> Path:
         return self.folder / "model"
 
-    @property
-    def logs_folder(self) -> Path:
-        return self.folder / "logs"
-
     @staticmethod
     def create(
         folder: Path, vessels_path: Path, cortex_path: Path | None, camera_path: Path | Camera, space: str = "LPS"

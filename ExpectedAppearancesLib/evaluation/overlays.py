@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 
@@ -10,7 +9,6 @@ import cv2
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.pose import transform
 from ..masks.labels import VESSELS
 
 TRUE_RGB = (40, 220, 60)
@@ -42,29 +40,6 @@ def draw_overlay(
         vessels = (labels == VESSELS).astype(np.uint8)
         contours = cv2.findContours(vessels, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
         cv2.drawContours(result, contours, -1, colour, width_px, cv2.LINE_AA)
-    return result
-
-
-def draw_box(
-    image: np.ndarray,
-    vertices_mm: np.ndarray,
-    camera: Camera,
-    camera_from_world: np.ndarray,
-    colour: tuple[int, int, int],
-    thickness_px: int = 1,
-) -> np.ndarray:
-    """Copy of the frame with the mesh's axis-aligned bounding box projected; nothing where a corner is behind."""
-    low, high = vertices_mm.min(axis=0), vertices_mm.max(axis=0)
-    sides = list(itertools.product((0, 1), repeat=3))
-    corners = transform(np.asarray(camera_from_world, float), np.where(sides, high, low))
-    result = image.copy()
-    if corners[:, 2].min() <= 0:
-        return result
-    # Clipped far outside the frame: OpenCV's drawing overflows on huge coordinates.
-    points = np.rint(np.clip(camera.without_distortion().project(corners), -1e4, 1e4) * 16).astype(int).tolist()
-    for (i, first), (j, second) in itertools.combinations(enumerate(sides), 2):
-        if np.abs(np.subtract(first, second)).sum() == 1:
-            cv2.line(result, points[i], points[j], colour, thickness_px, cv2.LINE_AA, shift=4)
     return result
 
 

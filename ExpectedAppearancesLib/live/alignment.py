@@ -95,11 +95,6 @@ def nudge_between(start: np.ndarray, moved: np.ndarray, pivot_world_mm: np.ndarr
     return transform(step, pivot[None])[0] - pivot, np.degrees(rotation_vector(step[:3, :3]))
 
 
-def pose_of_moved_vessels(camera_from_world: np.ndarray, moved_from_world: np.ndarray) -> np.ndarray:
-    """The pose of a camera that stands still while the vessels are moved, both in the same world, 4x4, mm."""
-    return np.asarray(camera_from_world, float) @ np.asarray(moved_from_world, float)
-
-
 def compare(vertices_mm: np.ndarray, true: np.ndarray, predicted: np.ndarray, camera: Camera) -> PoseDifference:
     """How far the predicted pose is from the true one; the reprojection counts vertices in front of both cameras."""
     true, predicted = np.asarray(true, float), np.asarray(predicted, float)

@@ -12,8 +12,6 @@ from ..live.feed import FeedState, FeedStatus
 from ..live.frames import LiveFrame
 from .live_nodes import ROLE_ATTRIBUTE
 
-NODE_CLASSES = ("vtkMRMLVectorVolumeNode", "vtkMRMLStreamingVolumeNode", "vtkMRMLScalarVolumeNode")
-
 
 class NodeFrames:
     """Hands on the pixels of a volume node whenever they change; finds the node again when it was removed and returns.

@@ -1,8 +1,8 @@
-"""A registered frame as a 3D Slicer scene: the only place of the library that touches MRML.
+"""A registered frame as a 3D Slicer scene.
 
 The scene's world is RAS, mm. The frame, its frustum and the predicted outline lie in camera mm (OpenCV axes) under one
-linear transform, 'CameraToRAS': a new pose moves them all. A Slicer module calls the add_... functions with its own
-scene and the set_... functions for each new frame; none of them needs more than the scene.
+linear transform, 'CameraToRAS': a new pose moves them all. Whoever has a scene calls the add_... functions, which need
+no more than that.
 """
 
 from __future__ import annotations
@@ -184,11 +184,6 @@ def add_outline(scene, silhouette: Silhouette, camera_from_world: np.ndarray, pl
     display.SetSliceDisplayModeToProjection()
     display.SetSliceIntersectionThickness(2)
     return node
-
-
-def set_outline(outline_node, silhouette: Silhouette, camera_from_world: np.ndarray, plane_mm: float) -> None:
-    """Redraw the outline for a new pose."""
-    outline_node.SetAndObservePolyData(_outline(silhouette, camera_from_world, plane_mm))
 
 
 def write_bundle(scene, path: Path) -> None:

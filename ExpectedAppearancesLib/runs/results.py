@@ -10,7 +10,7 @@ from pathlib import Path
 from .. import files
 from ..errors import InputError
 
-STAGES = {"render": "render", "synthesize": "synthesize", "train": "train"}
+STAGES = ("render", "synthesize", "train")  # those that case.json has a record of
 
 
 def result_problem(kind: str, case_folder: Path, thorough: bool = False) -> str:
@@ -24,7 +24,7 @@ def result_problem(kind: str, case_folder: Path, thorough: bool = False) -> str:
     if kind not in STAGES:
         return ""
     try:
-        stage = files.read_json(folder / "case.json", "case manifest")["stages"].get(STAGES[kind], {})
+        stage = files.read_json(folder / "case.json", "case manifest")["stages"].get(kind, {})
         if stage.get("done", kind == "render") is not True:
             return f"{folder / 'case.json'}: says that '{kind}' is not finished; start it again, it goes on from there."
         if kind == "synthesize":

@@ -35,11 +35,6 @@ class AlignSection:
         ui.solveButton.connect("clicked(bool)", lambda _checked=False: self._solve())
         ui.saveTruthButton.connect("clicked(bool)", lambda _checked=False: self._save())
 
-    @property
-    def lists(self) -> tuple | None:
-        """Landmarks in the frame and on the mesh, once there are any."""
-        return self._lists
-
     def show(self, can_align: bool) -> None:
         """Called on every tick: follow the handles, count the landmarks, compare the poses."""
         ui, aligning = self._ui, self._controller.alignment is not None

@@ -25,7 +25,7 @@ from ExpectedAppearancesLib.appearances.images import resized
 from ExpectedAppearancesLib.appearances.measure import GramMeasure
 from ExpectedAppearancesLib.appearances.synthesis import Job, Synthesizer
 from ExpectedAppearancesLib.appearances.vgg import SHIPPED_WEIGHTS, load_vgg
-from ExpectedAppearancesLib.appearances.workload import DEFAULT_ITERATIONS, images_at_once, operations_per_image
+from ExpectedAppearancesLib.appearances.workload import DEFAULT_ITERATIONS, images_at_once, operations_per_evaluation
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.devices import choose_device, fast_dtype
 from ExpectedAppearancesLib.files import read_label_map
@@ -62,9 +62,9 @@ def _side_by_side(
 ) -> dict:
     size = labels.shape[0]
     batch = images_at_once(labels.shape, DEFAULT_ITERATIONS, synthesizer.device)
-    operations = operations_per_image(
-        labels.shape, synthesizer.vgg.backbone, [float((labels == c).mean()) for c in CLASSES], DEFAULT_ITERATIONS
-    )
+    class_shares = tuple(float((labels == c).mean()) for c in CLASSES)
+    each = operations_per_evaluation(labels.shape, synthesizer.vgg.backbone, class_shares)
+    operations = each * (DEFAULT_ITERATIONS + 1)
     own, plain, shares, distances, peaks = [], [], [], [], {"own": 0.0, "plain": 0.0}
     start = time.monotonic()
     for turn in range(ROUNDS[size]):
