@@ -4,7 +4,7 @@ from cases import write_inputs
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
-from ExpectedAppearancesLib.demo import pipeline
+from ExpectedAppearancesLib.demo import phantom, pipeline
 from ExpectedAppearancesLib.errors import ExpectedAppearancesError, InputError
 from ExpectedAppearancesLib.masks.stage import render_case
 
@@ -50,3 +50,7 @@ def test_a_seed_below_0_is_bad_input(tmp_path):
     case = Case.create(tmp_path / "case", paths["vessels.vtp"], paths["cortex.vtp"], paths["camera.json"])
     with pytest.raises(InputError, match="seed: -1"):
         render_case(case, lambda *_: None, poses=1, seed=-1)
+
+
+def test_the_phantoms_network_is_the_one_that_its_text_describes():
+    assert phantom.network_bytes() == phantom.NETWORK.read_bytes()
