@@ -14,10 +14,11 @@ from . import store
 
 TILE_PX = 192
 LINE_PX = 22
+MOST = 12  # appearances shown
 LABEL_COLOURS = np.array([[0, 0, 0], [225, 170, 160], [90, 30, 110]], np.uint8)
 
 
-def write_contact_sheet(case: Case, method: str, textures: list[Texture], most: int = 12) -> Path:
+def write_contact_sheet(case: Case, method: str, textures: list[Texture]) -> Path:
     """Rows of (texture, its labels, mask, appearance), two to a row, each with its Gram distance to the texture;
     above them method, backbone and mean distances. Returns the PNG's path in the case."""
     _, appearances = store.read_appearances(case, method)
@@ -25,7 +26,7 @@ def write_contact_sheet(case: Case, method: str, textures: list[Texture], most: 
     by_name = {texture.name: texture for texture in textures}
     by_class = {item["image"]: item.get("gram_distance_by_class", {}) for item in index["items"]}
     known = [a for a in appearances if a.style in by_name]
-    chosen = [known[i] for i in np.unique(np.linspace(0, len(known) - 1, min(most, len(known))).astype(int))]
+    chosen = [known[i] for i in np.unique(np.linspace(0, len(known) - 1, min(MOST, len(known))).astype(int))]
     strips = []
     for appearance in chosen:
         texture = by_name[appearance.style]

@@ -61,17 +61,17 @@ def _affine_basis(height: int, width: int) -> np.ndarray:
     return basis / np.linalg.norm(basis, axis=1, keepdims=True)
 
 
-def warp(image: np.ndarray, field_px: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """Image (H, W[, C]) whose pixel (x, y) shows what `image` has at (x, y) + field; reflected at the border.
+def warp(image: np.ndarray, field_px: np.ndarray) -> np.ndarray:
+    """Image (H, W, C) whose pixel (x, y) shows what `image` has at (x, y) + field (H, W, 2); reflected at the border.
 
-    Use cv2.INTER_NEAREST for label maps, so that no labels are mixed.
+    Raises ValueError for a field of another size.
     """
     height, width = image.shape[:2]
     if field_px.shape != (height, width, 2):
         raise ValueError(f"field {field_px.shape} does not fit image {image.shape}")
     x, y = _grid(height, width)
     source_x, source_y = x + field_px[..., 0], y + field_px[..., 1]
-    return cv2.remap(image, source_x, source_y, interpolation, borderMode=cv2.BORDER_REFLECT_101)
+    return cv2.remap(image, source_x, source_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
 
 
 def nearest_pose(

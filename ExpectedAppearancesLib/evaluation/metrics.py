@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.pose import geodesic_angle_rad, pose_from_rotation
-from ..registration.confidence import GOOD_ADD_MM, calibration_error
+from ..registration.confidence import BINS, GOOD_ADD_MM, bin_of, calibration_error
 
 ADD_RANGE_MM = 20.0
 ACCURACY_LIMITS = (3, 5)  # n of the reported n mm-n deg
@@ -98,11 +98,11 @@ def add_accuracy(errors: FrameErrors, limit_mm: float) -> float | None:
     return _share(errors.add_mm < limit_mm)
 
 
-def add_auc(errors: FrameErrors, range_mm: float = ADD_RANGE_MM) -> float | None:
-    """Area under the curve of `add_accuracy` from 0 to `range_mm`, divided by the range; exact, not sampled."""
+def add_auc(errors: FrameErrors) -> float | None:
+    """Area under the curve of `add_accuracy` from 0 to ADD_RANGE_MM, divided by the range; exact, not sampled."""
     if not len(errors):
         return None
-    below = np.clip(1 - errors.add_mm / range_mm, 0, None)
+    below = np.clip(1 - errors.add_mm / ADD_RANGE_MM, 0, None)
     return float(np.where(np.isnan(below), 0.0, below).mean())
 
 
@@ -140,25 +140,25 @@ def metrics(errors: FrameErrors, styles: Sequence[str | None]) -> dict:
     return result
 
 
-def reliability(confidence: np.ndarray, errors: FrameErrors, bins: int = 10) -> dict:
-    """What the confidences (N,) 0..1 were worth: in each of `bins` equal ranges the number of frames, their mean
+def reliability(confidence: np.ndarray, errors: FrameErrors) -> dict:
+    """What the confidences (N,) 0..1 were worth: in each of BINS equal ranges the number of frames, their mean
     confidence and the share with ADD below GOOD_ADD_MM; and the mean gap between both, weighted by the numbers."""
     confidence, good = np.asarray(confidence, float), errors.add_mm < GOOD_ADD_MM
-    which = np.minimum((confidence * bins).astype(int), bins - 1)
+    which = bin_of(confidence)
     rows = []
-    for b in range(bins):
+    for b in range(BINS):
         own = which == b
         if own.any():
             rows.append(
                 {
-                    "from": b / bins,
-                    "to": (b + 1) / bins,
+                    "from": b / BINS,
+                    "to": (b + 1) / BINS,
                     "frames": int(own.sum()),
                     "confidence": float(confidence[own].mean()),
                     "add_below_3mm": float(good[own].mean()),
                 }
             )
-    return {"expected_calibration_error": calibration_error(confidence, good, bins), "bins": rows}
+    return {"expected_calibration_error": calibration_error(confidence, good), "bins": rows}
 
 
 def mean_pose(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarray:

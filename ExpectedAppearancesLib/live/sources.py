@@ -252,10 +252,8 @@ class CaptureDevice:
     size_px: width and height that it is asked for; it may have others.
     """
 
-    def __init__(
-        self, device: int | str, size_px: tuple[int, int] | None = None, clock: Callable[[], float] = time.monotonic
-    ):
-        self._device, self._size_px, self._clock = device, size_px, clock
+    def __init__(self, device: int | str, size_px: tuple[int, int] | None = None):
+        self._device, self._size_px = device, size_px
         self.dropped = 0
         self.can_wait = False
         self._number = 0
@@ -283,7 +281,7 @@ class CaptureDevice:
         self._number += 1
         if image.ndim == 3 and image.shape[2] == 3:
             image = np.ascontiguousarray(image[..., ::-1])
-        return LiveFrame(image, self._clock(), self._number - 1, f"{self._number - 1}")
+        return LiveFrame(image, time.monotonic(), self._number - 1, f"{self._number - 1}")
 
     def go_on(self) -> None:
         """Nothing was missed that could be had."""

@@ -10,9 +10,9 @@ from torch import nn
 class PaperRegressor(nn.Module):
     """The paper's P_Omega: 3 blocks of (conv, conv, ReLU), average pooling after all but the last, then 128-64-32-6."""
 
-    def __init__(self, size_px: int, channels: tuple[int, int, int] = (16, 32, 64), inputs: int = 3):
+    def __init__(self, size_px: int, inputs: int = 3):
         super().__init__()
-        layers, previous = [], inputs
+        layers, previous, channels = [], inputs, (16, 32, 64)
         for i, width in enumerate(channels):
             layers += [nn.Conv2d(previous, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1), nn.ReLU()]
             layers += [nn.AvgPool2d(2)] if i < len(channels) - 1 else []

@@ -20,6 +20,8 @@ FRUSTUMS, LOOKED_THROUGH, MASK = "Sampled cameras", "Camera looked through", "La
 MASK_COLOURS = "Label map colours"
 CLASS_COLOURS = ((0.0, 0.0, 0.0, 0.0), (0.90, 0.75, 0.68, 1.0), (0.82, 0.13, 0.15, 1.0))
 FRUSTUM_COLOUR, LOOKED_THROUGH_COLOUR = (0.20, 0.45, 0.75), (1.0, 0.82, 0.2)
+ROUNDING_MM = 1e-3  # of single precision
+LOOKED_FROM_MM = 200.0
 FRUSTUM_LENGTH = 0.18  # of the distance to the craniotomy: cameras stay recognisable and do not cover the cortex
 
 
@@ -56,12 +58,12 @@ def _turned(mesh: Mesh) -> Mesh:
     return Mesh(transform(RAS_FROM_LPS, mesh.vertices_mm), mesh.triangles)
 
 
-def same_mesh(first: Mesh, second: Mesh, tolerance_mm: float = 1e-3) -> bool:
+def same_mesh(first: Mesh, second: Mesh) -> bool:
     """Whether two meshes are the same up to the rounding of single precision."""
     return (
         first.vertices_mm.shape == second.vertices_mm.shape
         and np.array_equal(first.triangles, second.triangles)
-        and bool(np.abs(first.vertices_mm - second.vertices_mm).max(initial=0.0) <= tolerance_mm)
+        and bool(np.abs(first.vertices_mm - second.vertices_mm).max(initial=0.0) <= ROUNDING_MM)
     )
 
 
@@ -237,12 +239,12 @@ def look_at_mask(slice_node, camera: Camera, camera_from_world, plane_mm: float,
     slice_node.EndModify(modifying)
 
 
-def look_onto(camera_node, craniotomy: Craniotomy, space: str, distance_mm: float = 200.0) -> None:
+def look_onto(camera_node, craniotomy: Craniotomy, space: str) -> None:
     """Put a 3D view's camera over the craniotomy, upright as an upright microscope, looking at its centre."""
     to_ras = np.eye(3) if space == "RAS" else RAS_FROM_LPS[:3, :3]
     centre, outward, up = (to_ras @ v for v in (craniotomy.centre_world_mm, craniotomy.outward_axis, craniotomy.up))
     camera_node.SetFocalPoint(*centre)
-    camera_node.SetPosition(*(centre + distance_mm * outward))
+    camera_node.SetPosition(*(centre + LOOKED_FROM_MM * outward))
     camera_node.SetViewUp(*up)
     camera_node.ResetClippingRange()
 

@@ -78,7 +78,7 @@ def near_vessels(cortex: Mesh, vessels: Mesh) -> Mesh:
     return Mesh(cortex.vertices_mm[used], triangles.reshape(-1, 3))
 
 
-def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray, segments: int = 96) -> Mesh:
+def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray) -> Mesh:
     """Parenchyma for a case without a cortex model: a disc just below all vessels, 15 % wider than they are."""
     heights = (vessels.vertices_mm - vessels.centroid_mm) @ outward_axis
     centre = vessels.centroid_mm + outward_axis * (heights.min() - 0.1)
@@ -86,6 +86,7 @@ def disc_under_vessels(vessels: Mesh, outward_axis: np.ndarray, segments: int = 
     right = np.cross(outward_axis, helper)
     right /= np.linalg.norm(right)
     up = np.cross(outward_axis, right)
+    segments = 96
     angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
     rim = centre + 1.15 * vessels.radius_mm * (np.cos(angle) * right + np.sin(angle) * up)
     index = np.arange(segments)

@@ -8,6 +8,7 @@ import numpy as np
 
 GOOD_ADD_MM = 3.0
 PRECISION_WANTED = 0.99  # of accepted validation views, negatives among them
+BINS = 10  # of confidence, for its reliability
 LEAST_PROBABILITY = 0.9  # of any single accepted frame, however well the sure ones make up for it
 
 
@@ -75,8 +76,13 @@ def _threshold(probability: np.ndarray, good: np.ndarray) -> float:
     return float(min(max(probability[order[enough[-1]]], LEAST_PROBABILITY), 0.99))
 
 
-def calibration_error(probability: np.ndarray, good: np.ndarray, bins: int = 10) -> float:
+def bin_of(probability: np.ndarray) -> np.ndarray:
+    """In which of BINS equal ranges each probability (N,), 0..1, lies."""
+    return np.minimum((probability * BINS).astype(int), BINS - 1)
+
+
+def calibration_error(probability: np.ndarray, good: np.ndarray) -> float:
     """Expected calibration error: mean gap between probability and share of good ones, weighted by bin size."""
-    which = np.minimum((probability * bins).astype(int), bins - 1)
+    which = bin_of(probability)
     gaps = [abs(probability[which == b].mean() - good[which == b].mean()) * (which == b).sum() for b in set(which)]
     return float(sum(gaps) / max(1, len(probability)))

@@ -22,7 +22,6 @@ class Palette:
     mottling: float = 1.0
     arteries: int = 14
     wetness: float = 1.0
-    grain: float = 1.0
 
 
 def noise(rng: np.random.Generator, size: int, cells: float) -> np.ndarray:
@@ -59,30 +58,26 @@ def paint_parenchyma(rng: np.random.Generator, size: int, palette: Palette) -> n
     image = mix(image, palette.crown, 0.75 * soft_step(fractal(rng, size, 4, 3), 0.3, 0.35))
     image = mix(image, palette.blush, 0.7 * palette.mottling * soft_step(fractal(rng, size, 5, 4), 0.75, 0.3))
     image = mix(image, palette.blush, 0.35 * palette.mottling * soft_step(fractal(rng, size, 28, 3), 0.9, 0.3))
-    light = 1 + 0.05 * fractal(rng, size, 9, 4) + 0.022 * palette.grain * fractal(rng, size, 60, 3, 0.8)
+    light = 1 + 0.05 * fractal(rng, size, 9, 4) + 0.022 * fractal(rng, size, 60, 3, 0.8)
     return image * light[..., None].astype(np.float32)
 
 
-def paint_arteries(
-    rng: np.random.Generator, image: np.ndarray, palette: Palette, scale: float = 1.0, count: int | None = None
-) -> np.ndarray:
-    """Draw a net of fine red arteries (1 to 3 px x scale) and of fainter capillaries onto float RGB."""
+def paint_arteries(rng: np.random.Generator, image: np.ndarray, palette: Palette) -> np.ndarray:
+    """Draw a net of fine red arteries, 1 to 3 px wide, and of fainter capillaries onto float RGB."""
     import cv2
 
     size = image.shape[0]
     layer = np.zeros((size, size), np.float32)
-    for _ in range(palette.arteries if count is None else count):
+    for _ in range(palette.arteries):
         edge = rng.integers(4)
         along, inward = rng.uniform(0, size), rng.uniform(-0.1, 0.4) * size
         start = [(along, inward), (size - inward, along), (along, size - inward), (inward, along)][edge]
         heading = np.pi / 2 * (edge + 1) + rng.normal(0, 0.6)
-        _draw_artery(rng, layer, np.array(start), heading, rng.uniform(1.8, 3.0) * scale, depth=0)
+        _draw_artery(rng, layer, np.array(start), heading, rng.uniform(1.8, 3.0), depth=0)
     capillaries = np.zeros_like(layer)
     for _ in range(round(palette.arteries * 12)):
-        _draw_artery(rng, capillaries, rng.uniform(0, size, 2), rng.uniform(0, 6.3), 1.0 * scale, depth=3)
-    share = 0.75 * cv2.GaussianBlur(layer, (0, 0), 0.6 * scale) + 0.3 * cv2.GaussianBlur(
-        capillaries, (0, 0), 0.7 * scale
-    )
+        _draw_artery(rng, capillaries, rng.uniform(0, size, 2), rng.uniform(0, 6.3), 1.0, depth=3)
+    share = 0.75 * cv2.GaussianBlur(layer, (0, 0), 0.6) + 0.3 * cv2.GaussianBlur(capillaries, (0, 0), 0.7)
     # Fine vessels fade where they dive below the surface.
     fading = 0.55 + 0.45 * soft_step(fractal(rng, size, 7, 2), -0.3, 0.4)
     return mix(image, palette.artery, np.clip(share * fading, 0, 0.9).astype(np.float32))
@@ -129,7 +124,7 @@ def tube_profile(points_px: np.ndarray, radii_px: np.ndarray, size: int) -> tupl
 
 
 def paint_veins(
-    rng: np.random.Generator, image: np.ndarray, palette: Palette, across: np.ndarray, shaded: np.ndarray | None = None
+    rng: np.random.Generator, image: np.ndarray, palette: Palette, across: np.ndarray, shaded: np.ndarray
 ) -> np.ndarray:
     """Colour the veins (across < 1) and the shadow beside them; `shaded` (H, W): brightness of the tube."""
     size = image.shape[0]
@@ -139,9 +134,7 @@ def paint_veins(
     colour = mix(colour, palette.vein_edge, np.clip(across, 0, 1) ** 2.5)
     # Blood streams and the wall's thickness vary along the vein.
     variation = 1 + 0.09 * fractal(rng, size, 16, 3) + 0.03 * fractal(rng, size, 90, 2)
-    colour = colour * variation[..., None].astype(np.float32)
-    if shaded is not None:
-        colour = colour * shaded[..., None]
+    colour = colour * variation[..., None].astype(np.float32) * shaded[..., None]
     inside = np.clip((1.04 - across) / 0.12, 0, 1)
     return mix(image, colour, inside)
 
