@@ -108,17 +108,10 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 
 def read_image_rgb(path: Path) -> np.ndarray:
-    """Image file (PNG, JPEG, TIFF, 8 or 16 bit, grey or colour) as uint8 RGB (H, W, 3). Raises InputError.
-
-    VIDEO#frame=N, as `register` writes, is frame N of a video.
-    """
+    """Image file (PNG, JPEG, TIFF, 8 or 16 bit, grey or colour) as uint8 RGB (H, W, 3). Raises InputError."""
     import cv2
 
     path = Path(path)
-    if "#frame=" in path.name and not os.path.isfile(path):
-        from .registration.footage import read_video_frame
-
-        return read_video_frame(path)
     if not os.path.isfile(path):
         raise InputError(f"{path}: image not found; check the path.")
     image = _decoded(path, cv2.IMREAD_COLOR)

@@ -18,7 +18,7 @@ from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.pose import look_at
 from ExpectedAppearancesLib.model.encoding import fit_encoding
 from ExpectedAppearancesLib.registration import predictor as predictor_module
-from ExpectedAppearancesLib.registration.footage import Footage
+from ExpectedAppearancesLib.registration.footage import Footage, read_frame_rgb
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
 from ExpectedAppearancesLib.registration.predictor import Prediction
 
@@ -74,11 +74,11 @@ def test_video_gives_its_frames_in_rgb_with_their_times(video):
 def test_a_written_frame_can_be_read_again(tmp_path, suffix, codec):
     write_video(tmp_path / f"v{suffix}", codec)
     for number in (13, 0, 19):
-        image = files.read_image_rgb(tmp_path / f"v{suffix}#frame={number}")
+        image = read_frame_rgb(tmp_path / f"v{suffix}#frame={number}")
         np.testing.assert_allclose(image[40, 40], grey(LEVELS[number])[0, 0], atol=6)
     for wrong in (f"v{suffix}#frame=20", f"v{suffix}#frame=x", f"w{suffix}#frame=1"):
         with pytest.raises(InputError, match=wrong):
-            files.read_image_rgb(tmp_path / wrong)
+            read_frame_rgb(tmp_path / wrong)
 
 
 def test_a_frame_is_found_where_frames_are_not_equally_long(tmp_path):
@@ -91,7 +91,7 @@ def test_a_frame_is_found_where_frames_are_not_equally_long(tmp_path):
     frames = list(Footage([path]))
     np.testing.assert_allclose(np.diff([f.time_s for f in frames]), [0.04] * 10 + [0.16] * 9, atol=1e-6)
     for number in (17, 18, 3, 19, 3):
-        image = files.read_image_rgb(tmp_path / f"v.mp4#frame={number}")
+        image = read_frame_rgb(tmp_path / f"v.mp4#frame={number}")
         np.testing.assert_array_equal(image, frames[number].read_rgb())
 
 

@@ -13,7 +13,7 @@ from .. import files
 from ..case.case import Case
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera
-from ..registration.footage import FRAME_MARK, is_there
+from ..registration.footage import FRAME_MARK, is_there, read_frame_rgb
 from ..registration.poses_file import Frame, check_vessels, read_poses, write_poses
 from ..registration.record import frame_record
 from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics, reliability
@@ -139,7 +139,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
     """Raise InputError when the image of a frame cannot be read, or is none that the camera takes."""
     from ..registration.predictor import fitted_camera
 
-    height, width = files.read_image_rgb(frame.image).shape[:2]
+    height, width = read_frame_rgb(frame.image).shape[:2]
     try:
         fitted_camera(camera, width, height)
     except InputError as error:
@@ -161,7 +161,7 @@ def register_frames(true: list[Frame], camera: Camera, predictor, progress: Prog
     predicted, problems = [], Problems()
     for i, frame in enumerate(true):
         with problems.collect():
-            image = files.read_image_rgb(frame.image)
+            image = read_frame_rgb(frame.image)
             try:
                 prediction = predictor.predict(image, camera)
             except InputError as error:
@@ -233,7 +233,7 @@ def overlay_images(case: Case, evaluation: Evaluation, indices: Iterable[int]) -
     renderers: dict[Camera, MaskRenderer] = {}
     results = []
     indices = list(indices)
-    images = {index: files.read_image_rgb(evaluation.true[index].image) for index in sorted(indices)}  # as a video runs
+    images = {index: read_frame_rgb(evaluation.true[index].image) for index in sorted(indices)}  # as a video runs
     try:
         for index in indices:
             true, predicted, image = evaluation.true[index], evaluation.predicted[index], images[index]

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .. import files
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.pose import transform
 from ..registration.confidence import GOOD_ADD_MM
+from ..registration.footage import read_frame_rgb
 from ..registration.poses_file import Frame
 from ..registration.predictor import fitted_camera
 from .metrics import FrameErrors, add_accuracy, frame_errors, reliability, summary
@@ -86,7 +86,7 @@ def example_sheet(frame: Frame, camera: Camera, vertices_mm: np.ndarray, seed: i
 
 
 def _state(frame: Frame, camera: Camera, vertices_mm: np.ndarray) -> FrameState:
-    image = files.read_image_rgb(frame.image)
+    image = read_frame_rgb(frame.image)
     own = fitted_camera(camera, image.shape[1], image.shape[0])
     depth_mm = float(transform(frame.camera_from_world, vertices_mm.mean(axis=0)[None])[0, 2])
     return FrameState(image, own, own.fx / depth_mm)

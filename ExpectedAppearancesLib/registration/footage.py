@@ -111,8 +111,14 @@ def is_there(image: Path) -> bool:
     return (found[0] if found else image).is_file()
 
 
-def read_video_frame(path: Path) -> np.ndarray:
-    """The frame that a path VIDEO#frame=N names, uint8 RGB (H, W, 3). Raises InputError."""
+def read_frame_rgb(image: Path) -> np.ndarray:
+    """A frame as poses files name them, uint8 RGB (H, W, 3): an image file, or VIDEO#frame=N. Raises InputError."""
+    if FRAME_MARK in image.name and not os.path.isfile(image):
+        return _read_video_frame(image)
+    return files.read_image_rgb(image)
+
+
+def _read_video_frame(path: Path) -> np.ndarray:
     named = video_and_number(path)
     if named is None or not named[0].is_file():
         raise InputError(f"{path}: video not found; check the path.")
