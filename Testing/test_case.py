@@ -88,6 +88,7 @@ def test_an_empty_folder_is_filled_and_not_replaced(tmp_path, inputs, monkeypatc
 
 def test_each_file_that_may_not_be_read_is_a_problem_of_its_own(tmp_path, inputs, monkeypatch):
     """Of many frames or meshes only the first was named, with the advice to free some space."""
+    import cv2  # noqa: F401 - from the disk, too, which is refused below
 
     def refused(*_arguments, **_named):
         raise PermissionError(errno.EACCES, "Permission denied")
