@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -114,20 +115,20 @@ def read_image_rgb(path: Path) -> np.ndarray:
     path = Path(path)
     if not os.path.isfile(path):
         raise InputError(f"{path}: image not found; check the path.")
-    image = _decoded(path, cv2.IMREAD_COLOR)
+    with reading(path):
+        image = decoded(path.read_bytes(), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path}: not an image that can be read (or damaged); give a PNG, JPEG or TIFF file.")
     return np.ascontiguousarray(image[..., ::-1])
 
 
-def _decoded(path: Path, mode: int) -> np.ndarray | None:
-    """As cv2.imread, which fails on non-ASCII paths on Windows; None for what is no image."""
+def decoded(data: bytes, mode: int) -> np.ndarray | None:
+    """As cv2.imread of a file that holds `data`, which fails on non-ASCII paths on Windows; None for what is no
+    image."""
     import cv2
 
-    with reading(path):
-        data = np.frombuffer(path.read_bytes(), np.uint8)
     try:
-        return cv2.imdecode(data, mode) if data.size else None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data else None
     except cv2.error:  # the size that a damaged header tells
         return None
 
@@ -139,7 +140,8 @@ def read_label_map(path: Path) -> np.ndarray:
     path = Path(path)
     if not os.path.isfile(path):
         raise InputError(f"{path}: label map not found; check the path.")
-    labels = _decoded(path, cv2.IMREAD_UNCHANGED)
+    with reading(path):
+        labels = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED)
     if labels is None:
         raise InputError(f"{path}: label map cannot be read (or damaged); save it as an 8-bit grey PNG.")
     if labels.ndim == 3:
@@ -151,6 +153,11 @@ def read_label_map(path: Path) -> np.ndarray:
             f"{path}: label map holds the value {labels.max()}; save it as an 8-bit grey PNG with values 0, 1, 2."
         )
     return labels.astype(np.uint8)
+
+
+def natural_order(name: str) -> list:
+    """Key that sorts names by the numbers in them: frame_9 before frame_10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def sha256(path: Path) -> str:

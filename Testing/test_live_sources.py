@@ -49,10 +49,11 @@ def write_images(folder, names):
 
 
 def test_folder_is_read_in_the_order_of_its_numbers(tmp_path):
-    write_images(tmp_path, ["f_10.png", "f_9.png", "f_1.png"])
+    """A digit that is no number, such as the square, ended the source."""
+    write_images(tmp_path, ["f_10.png", "f_9.png", "f_1.png", "f_10²3.png"])
     source = sources.ImageFiles(tmp_path, rate_hz=1000)
     source.open()
-    assert [frame.name for frame in read_all(source, 3)] == ["f_1.png", "f_9.png", "f_10.png"]
+    assert [frame.name for frame in read_all(source, 4)] == ["f_1.png", "f_9.png", "f_10.png", "f_10²3.png"]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp"])
@@ -87,8 +88,8 @@ def test_a_folder_of_thousands_is_not_sorted_for_each_image(tmp_path, monkeypatc
     source = sources.ImageFiles(tmp_path, rate_hz=1000, only_new=only_new)
     source.open()
     looked_at = []
-    in_order = sources._natural_order
-    monkeypatch.setattr(sources, "_natural_order", lambda path: looked_at.append(path) or in_order(path))
+    in_order = files.natural_order
+    monkeypatch.setattr(files, "natural_order", lambda name: looked_at.append(name) or in_order(name))
     if only_new:
         (tmp_path / "50.png").write_bytes(data)
     names = ["50.png"] if only_new else [f"{i}.png" for i in range(50)]

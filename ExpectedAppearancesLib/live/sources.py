@@ -7,7 +7,6 @@ SourceLost when it has to be opened again. Sources pace themselves, so that a vi
 from __future__ import annotations
 
 import os
-import re
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -150,7 +149,8 @@ class ImageFiles:
             raise SourceLost(
                 f"{self._folder}: folder cannot be read ({error.strerror}); check the drive or the network."
             ) from error
-        return sorted((p for p in new if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != "."), key=_natural_order)
+        images = (p for p in new if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != ".")
+        return sorted(images, key=lambda path: files.natural_order(path.name.lower()))
 
     def _whole_file(self, path: Path) -> bytes | None:
         """The file's content, or None while it is being written. Raises InputError for one that never gets whole."""
@@ -292,11 +292,6 @@ class CaptureDevice:
             self._capture = None
 
 
-def _natural_order(path: Path) -> list:
-    """frame_9 before frame_10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", path.name.lower())]
-
-
 def _has_its_end(data: bytes, suffix: str) -> bool | None:
     """Whether the file is whole; None where the format has no mark at its end."""
     if suffix == ".png":
@@ -309,10 +304,7 @@ def _has_its_end(data: bytes, suffix: str) -> bool | None:
 def _decoded(data: bytes, path: Path) -> np.ndarray:
     import cv2
 
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    except cv2.error:  # a damaged header's size
-        image = None
+    image = files.decoded(data, cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path}: not an image that can be read (or damaged); it is left out.")
     return np.ascontiguousarray(image[..., ::-1])

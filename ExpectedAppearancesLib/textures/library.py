@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -207,6 +206,4 @@ def _named_images(folder: Path) -> tuple[dict[str, Path], list[str]]:
                 f"{path}: another texture is called {path.stem} too ({images[path.stem].name}); rename one."
             )
         images[path.stem] = path
-    # Natural order, so that texture 10 follows 9.
-    names = sorted(images, key=lambda name: [int(p) if p.isdecimal() else p for p in re.split(r"(\d+)", name)])
-    return {name: images[name] for name in names}, problems
+    return {name: images[name] for name in sorted(images, key=files.natural_order)}, problems
