@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.geometry.camera import Camera, read_camera, write_camera
+from ExpectedAppearancesLib.geometry.camera import Camera, read_camera, undistorted, write_camera
 
 DISTORTED = Camera(640, 480, 700.0, 720.0, 300.0, 260.0, (0.12, -0.2, 0.004, -0.003, 0.05))
 
@@ -176,3 +176,14 @@ def test_a_file_that_was_edited_on_windows_is_read(tmp_path):
     text = (tmp_path / "camera.json").read_text(encoding="utf-8")
     (tmp_path / "camera.json").write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
     assert read_camera(tmp_path / "camera.json").matrix.tolist() == camera.matrix.tolist()
+
+
+def test_undistorted_frame_shows_a_point_where_the_ideal_camera_sees_it():
+    camera = Camera(96, 96, 180.0, 180.0, 47.5, 47.5, (-0.9, 0.0, 0.0, 0.0, 0.0))
+    point = np.array([[16.0, -14.0, 80.0]])
+    image = np.zeros((96, 96, 3), np.uint8)
+    cv2.circle(image, tuple(np.rint(camera.project(point)[0]).astype(int).tolist()), 2, (255, 255, 255), -1)
+    rows, columns = np.nonzero(undistorted(image, camera)[..., 0] > 100)
+    ideal = camera.without_distortion().project(point)[0]
+    assert np.linalg.norm(ideal - camera.project(point)[0]) > 2
+    np.testing.assert_allclose((columns.mean(), rows.mean()), ideal, atol=1)

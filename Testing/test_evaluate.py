@@ -4,7 +4,6 @@ import json
 import zlib
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -313,17 +312,6 @@ def test_few_frames_are_all_chosen():
     assert overlays.choose_frames(np.array([3.0, 1.0, 2.0]), ["a"] * 3, 12) == [1, 2, 0]
     assert overlays.choose_frames(np.array([3.0, np.nan, 2.0]), ["a"] * 3, 12) == [2, 0, 1]
     assert len(overlays.choose_frames(np.full(5, np.nan), ["a"] * 5, 12)) == 1
-
-
-def test_undistorted_frame_shows_a_point_where_the_ideal_camera_sees_it():
-    camera = Camera(96, 96, 180.0, 180.0, 47.5, 47.5, (-0.9, 0.0, 0.0, 0.0, 0.0))
-    point = np.array([[16.0, -14.0, 80.0]])
-    image = np.zeros((96, 96, 3), np.uint8)
-    cv2.circle(image, tuple(np.rint(camera.project(point)[0]).astype(int).tolist()), 2, (255, 255, 255), -1)
-    rows, columns = np.nonzero(overlays.undistorted(image, camera)[..., 0] > 100)
-    ideal = camera.without_distortion().project(point)[0]
-    assert np.linalg.norm(ideal - camera.project(point)[0]) > 2
-    np.testing.assert_allclose((columns.mean(), rows.mean()), ideal, atol=1)
 
 
 def test_sheet_and_overlay_refuse_what_does_not_fit():

@@ -12,7 +12,7 @@ import numpy as np
 from .. import files
 from ..case.case import Case
 from ..errors import InputError, Problems
-from ..geometry.camera import Camera
+from ..geometry.camera import Camera, undistorted
 from ..registration.footage import FRAME_MARK, is_there, read_frame_rgb
 from ..registration.poses_file import Frame, check_vessels, read_poses, write_poses
 from ..registration.record import frame_record
@@ -227,7 +227,7 @@ def overlay_images(case: Case, evaluation: Evaluation, indices: Iterable[int]) -
 
     from ..masks.renderer import MaskRenderer
     from ..masks.stage import craniotomy_of, parenchyma_of
-    from .overlays import draw_overlay, undistorted, with_caption
+    from .overlays import draw_overlay, with_caption
 
     parenchyma = parenchyma_of(case, craniotomy_of(case))
     renderers: dict[Camera, MaskRenderer] = {}

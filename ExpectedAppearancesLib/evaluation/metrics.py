@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.pose import geodesic_angle_rad, pose_from_rotation
+from ..geometry.pose import geodesic_angle_rad, mean_rotation, pose_from_rotation
 from ..registration.confidence import BINS, GOOD_ADD_MM, bin_of, calibration_error
 
 ADD_RANGE_MM = 20.0
@@ -167,8 +167,7 @@ def mean_pose(vertices_mm: np.ndarray, poses: Sequence[np.ndarray]) -> np.ndarra
     A baseline: a method that sees nothing in the image can do as well.
     """
     poses, centroid = np.asarray(poses, float), np.asarray(vertices_mm, float).mean(axis=0)
-    u, _, vt = np.linalg.svd(poses[:, :3, :3].sum(axis=0))
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotation = mean_rotation(poses[:, :3, :3])
     position = (poses[:, :3, :3] @ centroid + poses[:, :3, 3]).mean(axis=0)
     return pose_from_rotation(rotation, position - rotation @ centroid)
 

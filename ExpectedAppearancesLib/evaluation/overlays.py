@@ -8,18 +8,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ..geometry.camera import Camera
 from ..masks.labels import VESSELS
 
 TRUE_RGB = (40, 220, 60)
 PREDICTED_RGB = (50, 110, 255)
-
-
-def undistorted(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """The frame as an ideal camera with the same A sees it; label maps are drawn for that camera."""
-    if not camera.is_distorted:
-        return image
-    return cv2.undistort(image, camera.matrix, np.array(camera.distortion))
 
 
 def draw_overlay(

@@ -13,6 +13,7 @@ from .. import files
 from ..errors import InputError, Problems
 
 DISTORTION_LENGTHS = (4, 5, 8, 12, 14)  # the models of cv2.projectPoints
+ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,10 @@ class Camera:
             cx=(self.cx + 0.5) * sx - 0.5,
             cy=(self.cy + 0.5) * sy - 0.5,
         )
+
+    def has_aspect_of(self, width: int, height: int) -> bool:
+        """Whether a frame of width x height px has the aspect ratio of this camera's, so that A can be scaled to it."""
+        return abs(width * self.height / (height * self.width) - 1) <= ASPECT_TOLERANCE
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """Camera of the part of the frame that starts at pixel (left, top)."""
@@ -135,6 +140,13 @@ class Camera:
             raise InputError("camera: image size (px), field of view (mm) and working distance (mm) must be above 0.")
         focal_px = width * working_distance_mm / field_of_view_mm
         return Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+
+
+def undistorted(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """The frame (H, W[, C]) of `camera` as an ideal camera with the same A sees it, for whom label maps are drawn."""
+    import cv2
+
+    return cv2.undistort(image, camera.matrix, np.array(camera.distortion)) if camera.is_distorted else image
 
 
 def read_camera(path: Path) -> Camera:

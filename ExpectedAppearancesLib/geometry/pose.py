@@ -65,6 +65,12 @@ def geodesic_angle_rad(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.arctan2(sine, cosine)
 
 
+def mean_rotation(rotations: np.ndarray) -> np.ndarray:
+    """The chordal mean (3, 3) of rotations (N, 3, 3): the rotation nearest to the mean of their matrices."""
+    u, _, vt = np.linalg.svd(rotations.mean(axis=0))
+    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
 def look_at(centre_world_mm: np.ndarray, target_world_mm: np.ndarray, up_world: np.ndarray) -> np.ndarray:
     """camera_from_world of an OpenCV camera at `centre` that looks at `target` with `up_world` upwards in the image."""
     forward = np.asarray(target_world_mm, float) - centre_world_mm

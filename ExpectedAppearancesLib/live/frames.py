@@ -85,7 +85,7 @@ class FramePreparation:
         height, width = image.shape[:2]
         if self._frame_size != (width, height):
             self._frame_size, self._box = (width, height), None
-        with_borders = _same_aspect(self._camera, width, height)  # as A was calibrated
+        with_borders = self._camera.has_aspect_of(width, height)  # as A was calibrated
         box = (0, 0, width, height) if with_borders else None
         if self._settings.crop_borders:
             box = self._picture_box(image, with_borders)
@@ -104,7 +104,7 @@ class FramePreparation:
         """The frame without black borders; None where the camera was calibrated on a picture of another shape."""
 
         def fits(box: tuple) -> bool:
-            return with_borders or _same_aspect(self._camera, box[2], box[3])
+            return with_borders or self._camera.has_aspect_of(box[2], box[3])
 
         found = picture_box(image)
         known = self._box or found
@@ -169,9 +169,3 @@ def _union(first: tuple, second: tuple) -> tuple[int, int, int, int]:
     right = max(first[0] + first[2], second[0] + second[2])
     bottom = max(first[1] + first[3], second[1] + second[3])
     return left, top, right - left, bottom - top
-
-
-def _same_aspect(camera: Camera, width: int, height: int) -> bool:
-    from ..registration.predictor import ASPECT_TOLERANCE
-
-    return abs(width * camera.height / (height * camera.width) - 1) <= ASPECT_TOLERANCE

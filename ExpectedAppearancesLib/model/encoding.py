@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.camera import Camera
-from ..geometry.pose import pose_from_rotation, rotation_matrix, rotation_vector
+from ..geometry.pose import mean_rotation, pose_from_rotation, rotation_matrix, rotation_vector
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,10 @@ class PoseEncoding:
 
 
 def fit_encoding(poses: np.ndarray, centre_world_mm: np.ndarray, scale_mm: float) -> PoseEncoding:
-    """From sampled camera_from_world (N, 4, 4). The mean rotation is the chordal one (nearest to the mean matrix)."""
-    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    reference = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    """From sampled camera_from_world (N, 4, 4)."""
     centroids = poses[:, :3, :3] @ centre_world_mm + poses[:, :3, 3]
     return PoseEncoding(
-        reference,
+        mean_rotation(poses[:, :3, :3]),
         np.asarray(centre_world_mm),
         float(scale_mm),
         centroids.mean(axis=0),

@@ -17,7 +17,7 @@ from .. import files
 from ..case.case import Case
 from ..case.meshes import Mesh
 from ..errors import ExpectedAppearancesError, InputError
-from ..geometry.camera import Camera
+from ..geometry.camera import Camera, undistorted
 from ..geometry.pose import RAS_FROM_LPS, camera_to_ras, is_rigid, transform
 from ..geometry.silhouette import Silhouette
 
@@ -130,10 +130,7 @@ def set_frame(frame_node, image_rgb: np.ndarray, camera: Camera) -> None:
     from vtkmodules.vtkCommonDataModel import vtkImageData
 
     _check_frame(image_rgb, camera)
-    if camera.is_distorted:
-        from ..evaluation.overlays import undistorted
-
-        image_rgb = undistorted(image_rgb, camera)
+    image_rgb = undistorted(image_rgb, camera)
     data = vtkImageData()
     data.SetDimensions(camera.width, camera.height, 1)
     # Row v of the image is row j of the volume: no flip, the top of the frame is j = 0.

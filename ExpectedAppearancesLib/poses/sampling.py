@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.pose import pose_from_rotation, transform
+from ..geometry.se3 import cross_matrix
 from .craniotomy import Craniotomy
 
 MAX_TRIES = 200
@@ -135,6 +136,5 @@ class PoseSampler:
 
 def _turn(unit_axis: np.ndarray, angle_rad: float) -> np.ndarray:
     """Rotation about an axis (Rodrigues' formula); poses are drawn in 3D Slicer without loading OpenCV for it."""
-    x, y, z = unit_axis
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    skew = cross_matrix(unit_axis)
     return np.eye(3) + np.sin(angle_rad) * skew + (1 - np.cos(angle_rad)) * (skew @ skew)

@@ -23,7 +23,6 @@ from .refinement import VesselAligner
 
 FORMAT_VERSION = 4  # 4: poses are sought farther off on the frame itself, and confidence was calibrated on that
 EXPOSED_VESSELS_NAME = "exposed_vessels.vtp"
-ASPECT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ def open_predictor(case: Case, threads: int = 2) -> Predictor:
 
 def fitted_camera(camera: Camera, width: int, height: int) -> Camera:
     """A scaled to a frame of width x height px. Raises InputError when the frame has another aspect ratio."""
-    if abs(width * camera.height / (height * camera.width) - 1) > ASPECT_TOLERANCE:
+    if not camera.has_aspect_of(width, height):
         raise InputError(
             f"the frame is {width} x {height} px, the camera {camera.width} x {camera.height} px: another "
             "aspect ratio; give the intrinsics of these frames with --camera, or crop the frames as the camera was."
