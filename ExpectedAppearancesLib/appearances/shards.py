@@ -76,11 +76,10 @@ def make_shards(folder: Path, items: list[dict], textures: list[Texture], settin
     shards = []
     common = json.dumps(settings, sort_keys=True)
     for index, texture in enumerate(textures):
-        digest = hashlib.sha256(texture.image.tobytes() + texture.labels.tobytes()).hexdigest()
         own = []
         for item in items:
             if item["texture"] == index:
-                key = hashlib.sha256(f"{common} {digest} {item['labels']} {item['seed']}".encode()).hexdigest()
+                key = hashlib.sha256(f"{common} {texture.sha256} {item['labels']} {item['seed']}".encode()).hexdigest()
                 own.append({name: item[name] for name in ("image", "labels", "seed")} | {"key": key})
         for begin in range(0, len(own), SHARD_IMAGES):
             name = f"{texture.name}-{begin // SHARD_IMAGES:05d}"

@@ -40,14 +40,19 @@ def folder_of(case: Case, method: str) -> Path:
     return case.appearances_folder / method
 
 
+def index_path(case: Case, method: str) -> Path:
+    """Its SHA-256 tells one set of appearances from another."""
+    return folder_of(case, method) / "index.json"
+
+
 def write_index(case: Case, method: str, camera: Camera, settings: dict, items: list[dict], done: bool) -> None:
     content = {"method": method, "done": done, "camera": camera.to_dict(), "settings": settings, "items": items}
-    files.write_json(folder_of(case, method) / "index.json", content)
+    files.write_json(index_path(case, method), content)
 
 
 def read_index(case: Case, method: str) -> dict | None:
     """The index as written, or None where the method has not run."""
-    path = folder_of(case, method) / "index.json"
+    path = index_path(case, method)
     return files.read_json(path, "index of the expected appearances") if path.is_file() else None
 
 
@@ -76,7 +81,7 @@ def read_appearances(case: Case, method: str | None = None) -> tuple[str, list[A
         index = read_index(case, name)
         if index and index["done"]:
             folder = folder_of(case, name)
-            camera = Camera.from_dict(index["camera"], str(folder / "index.json"))
+            camera = Camera.from_dict(index["camera"], str(index_path(case, name)))
             found = [
                 Appearance(
                     folder / item["image"],

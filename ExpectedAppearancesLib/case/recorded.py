@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from ..appearances.store import METHODS, newest_image
+from ..appearances.store import METHODS, folder_of, index_path, newest_image
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
 from .case import MANIFEST_NAME, Case
@@ -50,8 +50,7 @@ class CaseReader:
         case, problem = self.case(folder)
         if case is None:
             return Recorded(problem=problem)
-        index_path = case.appearances_folder / method / "index.json"
-        index, index_sha256 = self._once(index_path, _read_index) or (None, "")
+        index, index_sha256 = self._once(index_path(case, method), _read_index) or (None, "")
         model = self._once(case.model_folder / "model.json", _read_object)
         rows, stale = self.figures(case)
         state = self._once(case.model_folder / "checkpoint.safetensors", training_state) or {}
@@ -84,7 +83,7 @@ class CaseReader:
                 rows = []
             inputs = study.get("inputs") or {}
             used = inputs.get("appearances_sha256")
-            indices = (self._once(case.appearances_folder / m / "index.json", _read_index) for m in METHODS)
+            indices = (self._once(index_path(case, m), _read_index) for m in METHODS)
             current = [index[1] for index in indices if index]
             of_model = case.manifest["stages"].get("train", {}).get("appearances_sha256")
             # Of one method's they say nothing of a model of the other's.
@@ -106,7 +105,7 @@ class CaseReader:
 
     def newest_image(self, case: Case, method: str) -> tuple[Path | None, int]:
         """The appearance that was finished last, and how many there are."""
-        return self._once(case.appearances_folder / method, newest_image) or (None, 0)
+        return self._once(folder_of(case, method), newest_image) or (None, 0)
 
     def _open(self, path: Path) -> tuple[Case | None, str]:
         try:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from ..appearances.store import folder_of, read_appearances
+from ..appearances.store import index_path, read_appearances
 from ..case.case import Case, pose_settings
 from ..errors import InputError, Problems
 from ..executor import LOCAL, check_executor, run_jobs
@@ -213,7 +213,7 @@ def _open(folder: Path, poses_path: Path, settings: StudySettings) -> StudyCase:
     problems.raise_if_any()
     inputs = {
         "vessels_sha256": case.vessels_sha256,
-        "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
+        "appearances_sha256": files.sha256(index_path(case, method)),
         "poses_sha256": files.sha256(poses_path),
         "frames_sha256": digest_of(frames),
     } | pose_settings(case.manifest)

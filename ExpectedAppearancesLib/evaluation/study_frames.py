@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .. import files
-from ..appearances.store import folder_of, read_appearances
+from ..appearances.store import index_path, read_appearances
 from ..case.case import Case, pose_settings
 from ..errors import InputError
 from ..model.encoding import network_camera
@@ -38,7 +38,7 @@ def drawn_frames(
     method, appearances = read_appearances(case, method)
     folder = case.folder / "study" / "frames"
     made_of = {
-        "appearances_sha256": files.sha256(folder_of(case, method) / "index.json"),
+        "appearances_sha256": files.sha256(index_path(case, method)),
         "method": method,
         "per_texture": per_texture,
         "seed": seed,

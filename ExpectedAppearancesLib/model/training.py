@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 from .. import files
-from ..appearances.store import folder_of, read_appearances
+from ..appearances.store import index_path, read_appearances
 from ..cancelling import cancelling_waits
 from ..case.case import Case, pose_settings
 from ..case.meshes import write_vtp
@@ -172,7 +172,7 @@ class _Trainer:
         self.plausible = PlausibleView(
             craniotomy.centre_world_mm, craniotomy.outward_axis, ranges.tilt_max_deg, tuple(distance)
         )
-        self.appearances_sha256 = files.sha256(folder_of(case, views.method) / "index.json")
+        self.appearances_sha256 = files.sha256(index_path(case, views.method))
         # The poses are drawn around the craniotomy, and what a regression's numbers mean comes from the poses.
         identity = f"{preset.to_dict()} {seed} {views} {self.appearances_sha256} {ranges} {self.plausible.to_dict()}"
         identity += files.sha256(SHIPPED) if started else ""

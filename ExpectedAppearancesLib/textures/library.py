@@ -72,7 +72,7 @@ def read_library(folder: Path, exclude: Iterable[str] = ()) -> list[Texture]:
     problems at once: no folder, no textures, unknown excluded names, unreadable files, and what check_texture finds.
     """
     folder = Path(folder)
-    images = _image_paths(folder)
+    images = _checked_images(folder)
     exclude = {str(name) for name in exclude}
     problems = Problems()
     unknown = sorted(exclude - set(images))
@@ -81,40 +81,12 @@ def read_library(folder: Path, exclude: Iterable[str] = ()) -> list[Texture]:
             f"{folder}: no texture is called {', '.join(unknown)}, so it cannot be excluded; "
             f"there are {', '.join(images)}."
         )
-    shared_path = folder / SHARED_LABELS
-    shared_labels, shared_failed = None, False
     textures = []
-    for name, path in images.items():
-        if name in exclude:
-            continue
-        labels_path = folder / f"{name}{LABELS_SUFFIX}"
-        labels = None
-        with problems.collect():
-            if labels_path.is_file():
-                labels = files.read_label_map(labels_path)
-            elif shared_path.is_file():
-                labels_path = shared_path
-                if shared_labels is None and not shared_failed:
-                    shared_failed = True  # taken back below; so a bad shared map is reported once, not per texture
-                    shared_labels = files.read_label_map(shared_path)
-                    shared_failed = False
-                labels = shared_labels
-            else:
-                problems.add(
-                    f"{path}: has no label map; add {name}{LABELS_SUFFIX} (1 parenchyma, 2 vessels), "
-                    f"or one {SHARED_LABELS} for all textures."
-                )
-        image = None
-        with problems.collect():
-            image = files.read_image_rgb(path)
-        if image is None or labels is None:
-            continue
-        found = check_texture(path, image, labels_path, labels)
-        for problem in found:
-            if problem not in problems.found:
-                problems.add(problem)
-        if not found:
-            textures.append(Texture(name, image, labels))
+    for name, paths in images.items():
+        if name not in exclude:
+            with problems.collect():
+                textures.append(read_texture(name, *paths))
+    problems.found = list(dict.fromkeys(problems.found))  # what is wrong with a label map of all is said once
     if not textures and not problems.found:
         problems.add(f"{folder}: every texture is excluded; leave at least one.")
     problems.raise_if_any()
@@ -140,7 +112,10 @@ def problems_of_folder(folder: Path) -> list[str]:
 def read_texture(name: str, image_path: Path, labels_path: Path | None) -> Texture:
     """One texture. Raises InputError with all its problems."""
     if labels_path is None:
-        raise InputError(f"{image_path}: has no label map; label it, or remove it.")
+        raise InputError(
+            f"{image_path}: has no label map; add {name}{LABELS_SUFFIX} (1 parenchyma, 2 vessels), or one "
+            f"{SHARED_LABELS} for all textures, or remove it."
+        )
     problems = Problems()
     image = labels = None
     with problems.collect():
@@ -178,7 +153,7 @@ def check_texture(path: Path, image: np.ndarray, labels_path: Path, labels: np.n
     return found
 
 
-def _image_paths(folder: Path) -> dict[str, Path]:
+def _checked_images(folder: Path) -> dict[str, tuple[Path, Path | None]]:
     if not folder.is_dir():
         raise InputError(f"{folder}: textures folder not found; check the path.")
     images, problems = _named_images(folder)
@@ -186,7 +161,7 @@ def _image_paths(folder: Path) -> dict[str, Path]:
         raise InputError(problems)
     if not images:
         raise InputError(f"{folder}: holds no textures; put NAME.png with NAME{LABELS_SUFFIX} there.")
-    return images
+    return list_textures(folder)
 
 
 def _named_images(folder: Path) -> tuple[dict[str, Path], list[str]]:
