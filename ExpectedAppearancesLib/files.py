@@ -46,7 +46,7 @@ def reading(path: Path) -> Iterator[None]:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary neighbour of `path` (same suffix) that replaces it if the block succeeds.
 
-    Raises InputError naming the folder when it cannot be written or the disk is full.
+    Raises InputError naming `path` when it cannot be written or the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")

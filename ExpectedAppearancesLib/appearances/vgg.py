@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -29,9 +29,7 @@ class VggFeatures(torch.nn.Module):
         super().__init__()
         self.backbone = backbone
         self.compute_dtype = compute_dtype
-        self.names = [
-            f"conv{block + 1}_{k + 1}" for block, count in enumerate(CONVOLUTIONS[backbone]) for k in range(count)
-        ]
+        self.names = _names(CONVOLUTIONS[backbone])
         for name in self.names:
             weight = weights[f"{name}.weight"].to(compute_dtype)
             # The gradient of a 3x3 convolution with respect to its input is one with the weights turned round. After
@@ -108,7 +106,7 @@ class VggFeatures(torch.nn.Module):
 
     def carry_masks(self, masks: torch.Tensor) -> list[torch.Tensor]:
         """(B, C, H, W) class masks 0..1 -> the masks at each feature layer: halved at each pool, 3x3 box-averaged at
-        each convolution, as in neural doodle (METHOD.md, synthesis details)."""
+        each convolution, as in neural doodle."""
         carried, m = [], masks.float()
         for name in self.names:
             if self._follows_pool(name):
@@ -155,12 +153,7 @@ def load_vgg(weights_path: Path | None = None, compute_dtype: torch.dtype = torc
     if "features.0.weight" in tensors:
         tensors = _from_torchvision(tensors)
     backbone = "vgg19" if "conv3_4.weight" in tensors else "vgg16"
-    missing = [
-        f"conv{block + 1}_{k + 1}"
-        for block, count in enumerate(CONVOLUTIONS[backbone])
-        for k in range(count)
-        if f"conv{block + 1}_{k + 1}.weight" not in tensors
-    ]
+    missing = [name for name in _names(CONVOLUTIONS[backbone]) if f"{name}.weight" not in tensors]
     if missing:
         raise InputError(f"{path}: not VGG-16 or VGG-19 weights, {', '.join(missing)} missing; give the ImageNet file.")
     return VggFeatures(tensors, backbone, compute_dtype)
@@ -182,15 +175,19 @@ def download_vgg19(folder: Path) -> Path:
     return path
 
 
+def _names(counts: Sequence[int]) -> list[str]:
+    """Of the convolutions, of which there are so many in each block: conv1_1, conv1_2, conv2_1, ..."""
+    return [f"conv{block + 1}_{k + 1}" for block, count in enumerate(counts) for k in range(count)]
+
+
 def _from_torchvision(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """torchvision's state -> convB_K names, and its standardised RGB 0..1 input -> BGR 0..255 minus the mean."""
     indices = sorted(
         {int(key.split(".")[1]) for key in tensors if key.startswith("features.") and key.endswith("weight")}
     )
     counts = (2, 2, 3, 3, 3) if len(indices) == 13 else (2, 2, 4, 4, 4)
-    names = [f"conv{block + 1}_{k + 1}" for block, count in enumerate(counts) for k in range(count)]
     converted = {}
-    for name, index in zip(names, indices):
+    for name, index in zip(_names(counts), indices):
         converted[f"{name}.weight"] = tensors[f"features.{index}.weight"].float()
         converted[f"{name}.bias"] = tensors[f"features.{index}.bias"].float()
     scale = 255 * torch.tensor([0.229, 0.224, 0.225])

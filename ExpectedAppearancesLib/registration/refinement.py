@@ -28,7 +28,8 @@ FIELD_PX = 256  # edges are found between cells: on a raster this wide, or one o
 @dataclass(frozen=True)
 class Alignment:
     """fit: the refined pose with its covariance. matched: share of the outline in view that found an edge.
-    residual_px: mean distance of those from it. moved_mm: root mean square displacement of points at `radius_mm`."""
+    residual_px: mean distance of those from it. moved_mm: root mean square displacement of points at the mesh's rim.
+    """
 
     fit: PoseFit
     matched: float
