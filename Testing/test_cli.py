@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -61,15 +62,8 @@ def new_arguments(case, inputs, **replaced) -> list[str]:
 
 def stand_in_command(monkeypatch, run) -> None:
     """Make `render CASE` call `run(args, progress)`."""
-
-    class Module:
-        @staticmethod
-        def add_parser(subparsers):
-            parser = subparsers.add_parser("render")
-            parser.add_argument("case", type=Path)
-            parser.set_defaults(run=run)
-
-    monkeypatch.setattr(cli.importlib, "import_module", lambda _name, _package: Module)
+    module = SimpleNamespace(add_arguments=lambda parser: parser.add_argument("case", type=Path), run=run)
+    monkeypatch.setattr(cli.importlib, "import_module", lambda _name, _package: module)
 
 
 def fail_with(error):

@@ -13,9 +13,9 @@ from .. import files
 from ..case.case import Case
 from ..errors import InputError
 from ..geometry.camera import Camera
+from . import METHODS
 
 CONTACT_SHEET = "contact_sheet.png"  # lies beside them
-METHODS = ("surface", "image")
 
 
 @dataclass(frozen=True)

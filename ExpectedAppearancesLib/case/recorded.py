@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from .. import files
-from ..appearances.store import METHODS, folder_of, index_path, newest_image
+from ..appearances import METHODS
+from ..appearances.store import folder_of, index_path, newest_image
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
 from .case import MANIFEST_NAME, Case

@@ -27,7 +27,8 @@ from ..errors import (
 if TYPE_CHECKING:
     from .progress import Progress
 
-# name -> (module, help). Modules are imported only when their command is chosen: torch and VTK take seconds.
+# name -> (module with add_arguments and run, help). Imported only when the command is chosen: torch and VTK take
+# seconds.
 COMMANDS = {
     "demo": (".demo", "run the whole pipeline on a small generated case"),
     "new": (".new", "make a case folder from a vessel mesh, a cortex mesh and a camera"),
@@ -107,11 +108,20 @@ def _build_parser(argv: list[str]) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     chosen = next((word for word in argv if not word.startswith("-")), None)
     for name, (module, text) in COMMANDS.items():
+        command = subparsers.add_parser(name, help=text)
         if name == chosen:
-            importlib.import_module(module, __name__).add_parser(subparsers)
-        else:
-            subparsers.add_parser(name, help=text)
+            implementation = importlib.import_module(module, __name__)
+            implementation.add_arguments(command)
+            command.set_defaults(run=implementation.run)
     return parser
+
+
+def comma_separated(text: str) -> tuple[str, ...]:
+    """Type of an option that takes several names."""
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise argparse.ArgumentTypeError("names nothing; give names separated by commas")
+    return names
 
 
 @contextlib.contextmanager

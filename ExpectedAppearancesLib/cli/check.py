@@ -67,12 +67,10 @@ print(json.dumps([{"name": d.name, "memory_gb": round(d.total_memory / 2**30, 1)
 """
 
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser(
-        "check", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = DESCRIPTION
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
-    parser.set_defaults(run=run)
 
 
 def run(args, _progress) -> int:

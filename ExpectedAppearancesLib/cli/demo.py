@@ -6,22 +6,19 @@ import argparse
 from pathlib import Path
 
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser(
-        "demo",
-        help="run the whole pipeline on a small generated case",
-        description="Generates a vessel tree on a curved cortex and test frames painted in ways that are never trained "
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Generates a vessel tree on a curved cortex and test frames painted in ways that are never trained "
         "on, then runs every stage, offline and on a CPU: new, render, synthesize, train, register, evaluate. Ends "
-        "with overlays (PNG), a report and a scene for 3D Slicer. Started again, it goes on where it was.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        "with overlays (PNG), a report and a scene for 3D Slicer. Started again, it goes on where it was."
     )
+    parser.formatter_class = argparse.ArgumentDefaultsHelpFormatter
     parser.add_argument(
         "--out", type=Path, default=Path("expected-appearances-demo"), metavar="DIR", help="folder to fill"
     )
     parser.add_argument("--seed", type=int, default=0, help="another seed is another patient")
     parser.add_argument("--minutes", type=float, default=6.0, help="training time")
     parser.add_argument("--textures", type=int, default=6, help="how many of the shipped textures to use")
-    parser.set_defaults(run=run)
 
 
 def run(args, progress) -> None:

@@ -18,8 +18,9 @@ integers) or the YAML/XML that OpenCV's calibration writes. Without a calibratio
 --working-distance-mm and --image-size as the microscope states them."""
 
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser("new", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = DESCRIPTION
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("case", type=Path, metavar="CASE", help="folder to make; it must not exist, or be empty")
     parser.add_argument(
         "--vessels", type=Path, required=True, metavar="FILE", help="vessel mesh in mm (.vtp, .vtk, .stl, .ply, .obj)"
@@ -36,7 +37,6 @@ def add_parser(subparsers) -> None:
     parser.add_argument(
         "--space", choices=SPACES, default="LPS", help="axes of the mesh files' coordinates (default: %(default)s)"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args, progress) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser(
-        "register",
-        help="find the pose of microscope frames",
-        description="Finds the pose of each frame with the case's trained model and writes poses.json. A frame whose "
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Finds the pose of each frame with the case's trained model and writes poses.json. A frame whose "
         "pose cannot be trusted is refused (accepted: false). Images may be PNG, JPEG or TIFF of any size; a video is "
-        "given in their place, alone.",
+        "given in their place, alone."
     )
     parser.add_argument("case", metavar="CASE", help="case folder")
     parser.add_argument("images", nargs="+", type=Path, metavar="IMAGE", help="microscope frames, or one video")
@@ -25,7 +24,6 @@ def add_parser(subparsers) -> None:
     parser.add_argument(
         "--fps", type=float, metavar="HZ", help="frames per second, of images or where a video's own are wrong"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args, progress) -> None:

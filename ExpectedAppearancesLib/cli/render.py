@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import argparse
 
+from ..poses.sampling import PoseRanges
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser(
-        "render",
-        help="sample camera poses and render their label maps",
-        description="Samples plausible microscope poses over the craniotomy and renders a label map for each "
-        "(0 background, 1 parenchyma, 2 vessels). The ranges given here are also those of training.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+USUAL = PoseRanges()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Samples plausible microscope poses over the craniotomy and renders a label map for each "
+        "(0 background, 1 parenchyma, 2 vessels). The ranges given here are also those of training."
     )
+    parser.formatter_class = argparse.ArgumentDefaultsHelpFormatter
     parser.add_argument("case", metavar="CASE", help="case folder")
     parser.add_argument("--poses", type=int, default=100, metavar="N", help="number of poses")
     parser.add_argument("--seed", type=int, default=0, help="seed; the same seed gives the same poses")
-    parser.add_argument("--tilt-deg", type=float, default=70.0, help="largest tilt from the outward axis, degrees")
+    parser.add_argument(
+        "--tilt-deg", type=float, default=USUAL.tilt_max_deg, help="largest tilt from the outward axis, degrees"
+    )
     parser.add_argument(
         "--roll-deg",
         type=float,
-        default=45.0,
+        default=USUAL.roll_max_deg,
         help="largest rotation of the image, degrees, from the patient's superior direction upwards (180: any)",
     )
     parser.add_argument(
@@ -34,7 +38,10 @@ def add_parser(subparsers) -> None:
         "--lateral-mm", type=float, help="largest lateral offset, mm; left out: a quarter of the vessels' radius"
     )
     parser.add_argument(
-        "--in-view", type=float, default=0.6, help="least share of the vessels that must be in view, 0 to 1"
+        "--in-view",
+        type=float,
+        default=USUAL.in_view_min,
+        help="least share of the vessels that must be in view, 0 to 1",
     )
     parser.add_argument(
         "--point", type=float, nargs=3, metavar=("X", "Y", "Z"), help="centre of the craniotomy, world mm"
@@ -48,14 +55,12 @@ def add_parser(subparsers) -> None:
         metavar="SHARE",
         help="keep only a circle of this share of the image height as radius (the paper's authors use 0.333)",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args, progress) -> None:
     from ..case.case import Case
     from ..masks.stage import render_case
     from ..poses.craniotomy import find_craniotomy
-    from ..poses.sampling import PoseRanges
     from ..runs.record import exclusive
 
     case = Case.open(args.case)

@@ -5,18 +5,21 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..appearances import METHODS
+from ..executor import LOCAL
+from ..model.presets import PRESETS
+from . import comma_separated
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser(
-        "study",
-        help="leave-one-texture-out, number of textures, rivals and robustness, in one report",
-        description="Trains models on some textures of a case and tests them on frames of the others, whose poses are "
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Trains models on some textures of a case and tests them on frames of the others, whose poses are "
         "known: those of --poses, else views of the case's own appearances. Protocol strict: unseen texture and unseen "
         "poses. Protocol loto: the paper's leave-one-texture-out, "
         "where training views repeat the poses of the test frames. Writes CASE/study/study.json and one HTML report, "
-        "its pictures inside. Interrupted, it goes on where it was; the case's own model stays as it is.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        "its pictures inside. Interrupted, it goes on where it was; the case's own model stays as it is."
     )
+    parser.formatter_class = argparse.ArgumentDefaultsHelpFormatter
     parser.add_argument("cases", nargs="+", type=Path, metavar="CASE", help="case folders with appearances")
     parser.add_argument(
         "--poses",
@@ -28,15 +31,19 @@ def add_parser(subparsers) -> None:
     )
     parser.add_argument("--frames", type=int, default=24, metavar="N", help="frames to draw of each texture")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the report; left out: CASE/study/report")
-    parser.add_argument("--protocols", type=_names, default="strict,loto", metavar="A,B", help="strict, loto, or none")
+    parser.add_argument(
+        "--protocols", type=comma_separated, default="strict,loto", metavar="A,B", help="strict, loto, or none"
+    )
     parser.add_argument(
         "--preset",
-        type=_names,
+        type=comma_separated,
         default="quick",
         metavar="A,B",
-        help="what is trained: quick, best, paper, probseg, binseg; several are compared on the same frames",
+        help=f"what is trained: {', '.join(PRESETS)}; several are compared on the same frames",
     )
-    parser.add_argument("--styles", type=_names, metavar="A,B", help="textures to leave out; left out: all with frames")
+    parser.add_argument(
+        "--styles", type=comma_separated, metavar="A,B", help="textures to leave out; left out: all with frames"
+    )
     parser.add_argument(
         "--textures-study",
         action="store_true",
@@ -48,22 +55,14 @@ def add_parser(subparsers) -> None:
     parser.add_argument("--minutes", type=float, help="longest time of each training; left out: the preset's")
     parser.add_argument("--seed", type=int, default=0, help="seed of weights, views and choices")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
-    parser.add_argument("--appearances", choices=("surface", "image"), help="method whose appearances are used")
+    parser.add_argument("--appearances", choices=METHODS, help="method whose appearances are used")
     parser.add_argument(
         "--executor",
-        default="local",
+        default=LOCAL,
         metavar="WHERE",
         help="local: one training after another; dask://HOST:PORT: on the workers of that scheduler, which must see "
         "the same folders (start them with one thread each)",
     )
-    parser.set_defaults(run=run)
-
-
-def _names(text: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
-    if not names:
-        raise argparse.ArgumentTypeError("names nothing; give names separated by commas")
-    return names
 
 
 def run(args: argparse.Namespace, progress) -> None:

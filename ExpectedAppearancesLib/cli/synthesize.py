@@ -5,15 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..appearances import METHODS
+from ..executor import LOCAL, check_executor
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser(
-        "synthesize",
-        help="synthesise expected appearances from label maps and textures",
-        description="Makes images of what the cortex could look like: class-wise Gram texture synthesis (S_Theta). "
-        "Interrupted, it goes on where it was. Default textures: the ones that ship with the project.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Makes images of what the cortex could look like: class-wise Gram texture synthesis (S_Theta). "
+        "Interrupted, it goes on where it was. Default textures: the ones that ship with the project."
     )
+    parser.formatter_class = argparse.ArgumentDefaultsHelpFormatter
     parser.add_argument("case", metavar="CASE", help="case folder")
     parser.add_argument("--textures", type=Path, metavar="DIR", help="folder of photographs with label maps")
     parser.add_argument(
@@ -25,7 +26,7 @@ def add_parser(subparsers) -> None:
     parser.add_argument("--exclude", nargs="+", default=[], metavar="STYLE", help="textures to leave out")
     parser.add_argument(
         "--method",
-        choices=("surface", "image"),
+        choices=METHODS,
         default="surface",
         help="surface: once per texture on the whole surface, any view rendered from it; "
         "image: the paper's, one optimisation per pose",
@@ -43,10 +44,9 @@ def add_parser(subparsers) -> None:
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to compute")
     parser.add_argument(
         "--executor",
-        default="local",
+        default=LOCAL,
         help="local, or dask://HOST:PORT of a dask scheduler whose workers reach CASE under the same path",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args, progress) -> None:
@@ -64,11 +64,8 @@ def run(args, progress) -> None:
         value = getattr(args, name)
         if value is not None and value < least:
             problems.add(f"--{name}: {value}; give at least {least}.")
-    if args.executor != "local":
-        from ..executor import check_executor
-
-        with problems.collect():
-            check_executor(args.executor)
+    with problems.collect():
+        check_executor(args.executor)
     problems.raise_if_any()
     from ..runs.record import exclusive
 

@@ -5,21 +5,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..appearances import METHODS
+from ..model.presets import PRESETS
+
 ORPHAN_ENDS_S = 60.0
 
 
-def add_parser(subparsers) -> None:
-    parser = subparsers.add_parser(
-        "train",
-        help="train the pose network on the expected appearances",
-        description="Trains the patient's pose network P_Omega and exports it to ONNX. Interrupted, it goes on where "
-        "it was. Chooses its epoch on poses and a texture that it does not train on.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Trains the patient's pose network P_Omega and exports it to ONNX. Interrupted, it goes on where "
+        "it was. Chooses its epoch on poses and a texture that it does not train on."
     )
+    parser.formatter_class = argparse.ArgumentDefaultsHelpFormatter
     parser.add_argument("case", metavar="CASE", help="case folder")
     parser.add_argument(
         "--preset",
-        choices=("quick", "best", "paper", "probseg", "binseg"),
+        choices=tuple(PRESETS),
         default="quick",
         help="quick: half an hour on a CPU; best: reads frames finer, 90 minutes; paper: the paper's network, loss and "
         "schedule; probseg, binseg: its rivals, which segment the vessels first",
@@ -30,7 +31,7 @@ def add_parser(subparsers) -> None:
     parser.add_argument("--steps", type=int, help="training steps; left out: the preset's")
     parser.add_argument(
         "--appearances",
-        choices=("surface", "image"),
+        choices=METHODS,
         help="method whose appearances are used; left out: the one that is complete",
     )
     study = parser.add_argument_group("models for a study (the case's own model stays as it is)")
@@ -47,7 +48,6 @@ def add_parser(subparsers) -> None:
         action="store_true",
         help="train on every texture that is not left out, and choose the epoch on other poses alone",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args, progress) -> None:
@@ -84,7 +84,6 @@ def _train(args, case, progress) -> None:
 
     from ..devices import choose_device
     from ..model.fold import Fold
-    from ..model.presets import PRESETS
     from ..model.training import train_case
 
     given = {name: getattr(args, name) for name in ("minutes", "steps") if getattr(args, name) is not None}

@@ -18,7 +18,8 @@ from pathlib import Path
 from xml.sax.saxutils import escape
 
 from .. import cli
-from ..appearances.store import METHODS, newest_image
+from ..appearances import METHODS
+from ..appearances.store import newest_image
 from ..cli.progress import Progress, duration
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, CancelledError, InputError
 from .environment import MODULES
@@ -34,9 +35,9 @@ _TRAINING = re.compile(
 
 def parser_of(command: str) -> argparse.ArgumentParser:
     """The parser of one command, with the options and defaults of `python -m ExpectedAppearancesLib COMMAND`."""
-    subparsers = argparse.ArgumentParser().add_subparsers()
-    importlib.import_module(cli.COMMANDS[command][0], cli.__name__).add_parser(subparsers)
-    return subparsers.choices[command]
+    parser = argparse.ArgumentParser()
+    importlib.import_module(cli.COMMANDS[command][0], cli.__name__).add_arguments(parser)
+    return parser
 
 
 def command_arguments(command: str, arguments: Sequence[str]) -> list[str]:
