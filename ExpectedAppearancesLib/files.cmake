@@ -121,6 +121,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/planning_session.py
   ExpectedAppearancesLib/mrml/scene.py
   ExpectedAppearancesLib/mrml/segment_surface.py
+  ExpectedAppearancesLib/mrml/vtk_data.py
   ExpectedAppearancesLib/poses/__init__.py
   ExpectedAppearancesLib/poses/craniotomy.py
   ExpectedAppearancesLib/poses/sampling.py

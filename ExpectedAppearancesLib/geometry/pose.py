@@ -96,9 +96,14 @@ def flip_lps_ras(camera_from_world: np.ndarray) -> np.ndarray:
     return np.asarray(camera_from_world, float) @ RAS_FROM_LPS
 
 
+def ras_from_world(world_space: str) -> np.ndarray:
+    """4x4: mm of a world that is 'LPS' or 'RAS' -> Slicer's RAS mm; its own inverse."""
+    return RAS_FROM_LPS if world_space == "LPS" else np.eye(4)
+
+
 def camera_to_ras(camera_from_world: np.ndarray, world_space: str) -> np.ndarray:
     """Camera mm -> Slicer's RAS mm, from a pose whose world is 'LPS' or 'RAS'."""
-    return (RAS_FROM_LPS if world_space == "LPS" else np.eye(4)) @ inverse(np.asarray(camera_from_world, float))
+    return ras_from_world(world_space) @ inverse(np.asarray(camera_from_world, float))
 
 
 def apply_to_vtk_camera(vtk_camera, camera, camera_from_world: np.ndarray, near_mm: float, far_mm: float) -> None:

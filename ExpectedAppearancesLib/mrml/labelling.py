@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..masks.labels import BACKGROUND, PARENCHYMA, VESSELS
-from .scene import _vtk_matrix
+from .vtk_data import image_data, vtk_matrix
 
 PIXEL_MM = 0.1  # any size will do; this one suits the brushes of the Segment Editor
 # Segments by the label they stand for; what is in none of them is parenchyma.
@@ -20,8 +20,8 @@ def add_photograph(scene, name: str, image_rgb: np.ndarray, labels: np.ndarray) 
     colour = scene.AddNewNodeByClass("vtkMRMLVectorVolumeNode", name)
     grey = scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", f"{name} (green)")
     for node, pixels in ((colour, image_rgb), (grey, image_rgb[..., 1])):
-        node.SetIJKToRASMatrix(_vtk_matrix(np.diag([-PIXEL_MM, -PIXEL_MM, PIXEL_MM, 1.0])))
-        node.SetAndObserveImageData(_image_data(pixels))
+        node.SetIJKToRASMatrix(vtk_matrix(np.diag([-PIXEL_MM, -PIXEL_MM, PIXEL_MM, 1.0])))
+        node.SetAndObserveImageData(image_data(pixels))
         node.CreateDefaultDisplayNodes()
         if node.GetDisplayNode():
             node.GetDisplayNode().SetAutoWindowLevel(False)
@@ -53,7 +53,7 @@ def _add_segment(segmentation_node, volume, mask: np.ndarray, title: str, rgb) -
     import slicer
 
     image = slicer.vtkOrientedImageData()
-    image.ShallowCopy(_image_data(mask.astype(np.uint8)))
+    image.ShallowCopy(image_data(mask.astype(np.uint8)))
     image.SetImageToWorldMatrix(_matrix_of(volume))
     if not mask.any():
         segmentation_node.GetSegmentation().AddEmptySegment(title, title, list(rgb))
@@ -87,15 +87,3 @@ def _matrix_of(volume):
     matrix = vtkMatrix4x4()
     volume.GetIJKToRASMatrix(matrix)
     return matrix
-
-
-def _image_data(pixels: np.ndarray):
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-
-    data = vtkImageData()
-    data.SetDimensions(pixels.shape[1], pixels.shape[0], 1)
-    scalars = numpy_to_vtk(np.ascontiguousarray(pixels).reshape(pixels.shape[0] * pixels.shape[1], -1), deep=True)
-    scalars.SetName("ImageScalars")
-    data.GetPointData().SetScalars(scalars)
-    return data

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..case.case import Case
-from ..geometry.pose import RAS_FROM_LPS, inverse, transform
+from ..geometry.pose import inverse, ras_from_world, transform
 from ..live.alignment import LandmarkPose, pose_from_landmarks
 from . import scene as scenes
 from .live_nodes import ROLE_ATTRIBUTE
@@ -22,7 +22,7 @@ class Alignment:
 
     def __init__(self, live_scene: LiveScene, case: Case, start: np.ndarray):
         self._live, self._case, self._scene = live_scene, case, live_scene._scene
-        self._ras_from_world = RAS_FROM_LPS if case.space == "LPS" else np.eye(4)
+        self._ras_from_world = ras_from_world(case.space)
         self._start = np.asarray(start, float)
         self._before = inverse(inverse(self._ras_from_world) @ live_scene.camera_to_ras)
         live_scene.set_pose(self._start)
@@ -65,11 +65,7 @@ class Alignment:
         for name, node in self._live.models.items():
             if self._scene.IsNodePresent(node):
                 node.SetAndObserveTransformNodeID(self._parents[name])
-        if self._scene.IsNodePresent(self.handles):
-            display = self.handles.GetDisplayNode()
-            self._scene.RemoveNode(self.handles)
-            if display is not None and self._scene.IsNodePresent(display):
-                self._scene.RemoveNode(display)
+        scenes.remove_node(self._scene, self.handles)
         self._live.set_pose(pose)
         self._live.is_aligned_by_hand = False
         return pose
@@ -98,7 +94,7 @@ def pose_of_landmarks(live_scene: LiveScene, case: Case, in_frame, on_mesh) -> L
     camera = live_scene.camera
     points_mm = _points(in_frame)
     points_px = points_mm[:, :2] / points_mm[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    world_from_ras = inverse(RAS_FROM_LPS if case.space == "LPS" else np.eye(4))
+    world_from_ras = inverse(ras_from_world(case.space))
     return pose_from_landmarks(points_px, transform(world_from_ras, _points(on_mesh)), camera)
 
 

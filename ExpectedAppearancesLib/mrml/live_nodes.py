@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .scene import remove_node
+
 ROLE_ATTRIBUTE = "ExpectedAppearances.Live"  # on every node of the live panel: its role
 SEQUENCE_ATTRIBUTE = ROLE_ATTRIBUTE + ".Sequence"  # on every sequence of a recording: the role of what it plays into
 
@@ -21,7 +23,7 @@ def node_of_role(scene, role: str):
 
 def _played_into(scene, role: str):
     """The node that a recording plays into: of a loaded one Slicer copies the attributes too, and files keep none."""
-    for browser in _browsers(scene):
+    for browser in browsers(scene):
         for sequence in _nodes(scene):
             if sequence.GetAttribute(SEQUENCE_ATTRIBUTE) == role and browser.IsSynchronizedSequenceNodeID(
                 sequence.GetID(), True
@@ -31,15 +33,20 @@ def _played_into(scene, role: str):
     return None
 
 
-def _browsers(scene) -> list:
-    browsers = scene.GetNodesByClass("vtkMRMLSequenceBrowserNode")
-    browsers.UnRegister(None)
-    return [browsers.GetItemAsObject(i) for i in range(browsers.GetNumberOfItems())]
+def nodes_of_class(scene, kind: str) -> list:
+    """In the order in which they were added."""
+    found = scene.GetNodesByClass(kind)
+    found.UnRegister(None)
+    return [found.GetItemAsObject(i) for i in range(found.GetNumberOfItems())]
+
+
+def browsers(scene) -> list:
+    return nodes_of_class(scene, "vtkMRMLSequenceBrowserNode")
 
 
 def is_recorded(scene, node) -> bool:
     """Whether a sequence browser plays into the node."""
-    return any(browser.IsProxyNode(node.GetID()) for browser in _browsers(scene))
+    return any(browser.IsProxyNode(node.GetID()) for browser in browsers(scene))
 
 
 def hide_another_case(scene, folder: Path) -> list:
@@ -65,16 +72,7 @@ def remove_live_nodes(scene, but: tuple[str, ...] = ()) -> None:
         role = node.GetAttribute(ROLE_ATTRIBUTE)
         if not role or role in but or not scene.IsNodePresent(node) or is_recorded(scene, node):
             continue
-        # Display nodes of a model would stay behind without it.
-        displays = (
-            [node.GetNthDisplayNode(i) for i in range(node.GetNumberOfDisplayNodes())]
-            if (node.IsA("vtkMRMLDisplayableNode"))
-            else []
-        )
-        scene.RemoveNode(node)
-        for display in displays:
-            if display is not None and scene.IsNodePresent(display):
-                scene.RemoveNode(display)
+        remove_node(scene, node)
 
 
 def _nodes(scene) -> list:

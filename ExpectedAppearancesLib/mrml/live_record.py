@@ -18,7 +18,7 @@ from ..geometry.pose import camera_to_ras
 from ..live.recording import RecordedFrame, export_recording, from_note, to_note
 from ..live.session import LiveResult
 from . import scene as scenes
-from .live_nodes import ROLE_ATTRIBUTE, SEQUENCE_ATTRIBUTE, node_of_role
+from .live_nodes import ROLE_ATTRIBUTE, SEQUENCE_ATTRIBUTE, browsers, node_of_role, nodes_of_class
 from .live_scene import FRAME, TRANSFORM, LiveScene
 from .live_stream import pixels_of
 
@@ -110,10 +110,7 @@ class Recorder:
 
 def recordings(scene) -> list:
     """The browsers of recordings in the scene, also of one that was loaded, in the order they were made."""
-    found = scene.GetNodesByClass("vtkMRMLSequenceBrowserNode")
-    found.UnRegister(None)
-    nodes = [found.GetItemAsObject(i) for i in range(found.GetNumberOfItems())]
-    return [node for node in nodes if node.GetAttribute(BROWSER_ATTRIBUTE)]
+    return [browser for browser in browsers(scene) if browser.GetAttribute(BROWSER_ATTRIBUTE)]
 
 
 def pause_playback(scene, but=None) -> None:
@@ -206,10 +203,7 @@ def write_transform(path: Path, matrix_to_ras: np.ndarray) -> None:
 
 
 def _sequence(browser, role: str):
-    collection = browser.GetScene().GetNodesByClass("vtkMRMLSequenceNode")
-    collection.UnRegister(None)
-    for i in range(collection.GetNumberOfItems()):
-        node = collection.GetItemAsObject(i)
+    for node in nodes_of_class(browser.GetScene(), "vtkMRMLSequenceNode"):
         if node.GetAttribute(SEQUENCE_ATTRIBUTE) == role and browser.IsSynchronizedSequenceNodeID(node.GetID(), True):
             return node
     raise InputError(f"{browser.GetName()}: is no recording of this panel; choose one that was recorded here.")

@@ -17,6 +17,7 @@ from ..live.overlay import Overlay
 from ..live.session import LiveResult
 from . import scene as scenes
 from .live_nodes import ROLE_ATTRIBUTE, mark, node_of_role, remove_live_nodes
+from .vtk_data import array_of, image_data, line_polydata, vtk_matrix
 
 FIRST_PLANE_MM = 200.0  # where the frame is put up before any pose says how far the vessels are
 PLANE_CHANGE = 0.1  # share by which the vessels' depth may leave the plane before the plane follows
@@ -300,7 +301,7 @@ class LiveScene:
         self.frame.EndModify(was_modifying)
 
     def _place_frame(self) -> None:
-        self.frame.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(self.camera, self.plane_mm)))
+        self.frame.SetIJKToRASMatrix(vtk_matrix(scenes.camera_from_pixel(self.camera, self.plane_mm)))
         self.frame.SetAndObserveTransformNodeID(self.transform.GetID())
 
     def _show_fill(self) -> None:
@@ -311,7 +312,7 @@ class LiveScene:
 
     def _place_fill(self, camera: Camera) -> None:
         small = camera.resized(*self.fill.GetImageData().GetDimensions()[:2])
-        self.fill.SetIJKToRASMatrix(scenes._vtk_matrix(scenes.camera_from_pixel(small, self.plane_mm)))
+        self.fill.SetIJKToRASMatrix(vtk_matrix(scenes.camera_from_pixel(small, self.plane_mm)))
 
     def _add_aside(self):
         node = mark(self._scene.AddNewNodeByClass("vtkMRMLLinearTransformNode", "Microscope picture aside"), ASIDE)
@@ -351,7 +352,7 @@ class LiveScene:
         plane = scenes.camera_from_pixel(camera, self.plane_mm)
         plane[:2, 3] += 0.5 * self._view_pixel_mm, -0.5 * self._view_pixel_mm
         points_mm = np.column_stack([points_px, np.zeros(len(points_px))]) @ plane[:3, :3].T + plane[:3, 3]
-        self.lines[role].SetAndObservePolyData(scenes._line_polydata(points_mm, lines))
+        self.lines[role].SetAndObservePolyData(line_polydata(points_mm, lines))
 
     def _add_fill(self):
         colours = self._scene.AddNode(_colour_table())
@@ -382,7 +383,7 @@ def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
         transform_node.GetMatrixTransformToWorld(matrix)
     else:
         transform_node.GetMatrixTransformToParent(matrix)
-    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+    return array_of(matrix)
 
 
 def _set_visible(model, visible: bool) -> None:
@@ -393,8 +394,7 @@ def _set_visible(model, visible: bool) -> None:
 
 def _set_image(volume, image: np.ndarray) -> None:
     """New pixels uint8 (H, W, C) for a volume of one slice: into its own memory where the size is the same."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.util.numpy_support import vtk_to_numpy
 
     height, width, components = image.shape
     data = volume.GetImageData()
@@ -405,12 +405,7 @@ def _set_image(volume, image: np.ndarray) -> None:
         scalars.Modified()
         data.Modified()
         return
-    data = vtkImageData()
-    data.SetDimensions(width, height, 1)
-    scalars = numpy_to_vtk(np.ascontiguousarray(image).reshape(-1, components), deep=True)
-    scalars.SetName("ImageScalars")
-    data.GetPointData().SetScalars(scalars)
-    volume.SetAndObserveImageData(data)
+    volume.SetAndObserveImageData(image_data(image))
 
 
 def _textured_frame(camera: Camera, depth_mm: float):
@@ -419,11 +414,9 @@ def _textured_frame(camera: Camera, depth_mm: float):
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 
-    right, bottom = camera.width - 0.5, camera.height - 0.5
-    corners = np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
     plane = scenes.camera_from_pixel(camera, depth_mm)
     points = vtkPoints()
-    points.SetData(numpy_to_vtk(corners @ plane[:3, :3].T + plane[:3, 3], deep=True))
+    points.SetData(numpy_to_vtk(scenes.frame_corners(camera) @ plane[:3, :3].T + plane[:3, 3], deep=True))
     cells = vtkCellArray()
     cells.InsertNextCell(4, range(4))
     polydata = vtkPolyData()

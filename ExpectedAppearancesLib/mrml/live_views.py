@@ -160,21 +160,14 @@ def add_layout(layout_node, with_mri: bool = True) -> int:
 
 
 def align_slice(slice_node, camera: Camera, camera_to_ras: np.ndarray, plane_mm: float) -> None:
-    """Lay the slice onto the image plane, upright; zoom and pan stay as they are.
-
-    Slice views sample at the corners of their pixels: with pixel (W / 2, H / 2 - 1) at the origin the frame is sharp.
-    """
-    slice_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])  # the slice's y points up, the camera's down
-    middle = [camera.width / 2, camera.height / 2 - 1, 0, 1]
-    slice_to_camera[:, 3] = scenes.camera_from_pixel(camera, plane_mm) @ middle
-    _set_slice_to_ras(slice_node, camera_to_ras @ slice_to_camera)
+    """Lay the slice onto the image plane, upright; zoom and pan stay as they are."""
+    _set_slice_to_ras(slice_node, camera_to_ras @ scenes.camera_from_slice(camera, plane_mm))
 
 
 def fit_slice(slice_node, camera: Camera, plane_mm: float) -> None:
     """Zoom so that the whole frame is in view, with square pixels whatever the shape of the view."""
     view_width, view_height = slice_node.GetDimensions()[:2]
-    width, height = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
-    mm_per_px = max(width / max(view_width, 1), height / max(view_height, 1))
+    mm_per_px = scenes.fitted_mm_per_px(slice_node, camera, plane_mm)
     slice_node.SetXYZOrigin(0, 0, 0)
     slice_node.SetFieldOfView(mm_per_px * view_width, mm_per_px * view_height, mm_per_px)
 

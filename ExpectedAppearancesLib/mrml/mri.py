@@ -14,7 +14,7 @@ import numpy as np
 from .. import files
 from ..case.case import Case
 from ..errors import InputError
-from .scene import _vtk_matrix
+from .vtk_data import array_of, vtk_matrix
 
 MRI, FILE_NAME = "mri", "mri.nrrd"
 ATTRIBUTE = "ExpectedAppearances.CaseMRI"  # of a volume node: the digest of the case's scan that it shows
@@ -53,7 +53,7 @@ def placement(node) -> list[float]:
 
     matrix = vtkMatrix4x4()
     node.GetIJKToRASMatrix(matrix)
-    return [matrix.GetElement(i, j) for i in range(4) for j in range(4)]
+    return array_of(matrix).ravel().tolist()
 
 
 def is_scan_of(case: Case, identity: dict) -> bool:
@@ -167,18 +167,18 @@ def _hardened(node):
     if parent is not None and not parent.IsTransformToWorldLinear():
         to_world = vtkGeneralTransform()
         parent.GetTransformToWorld(to_world)
-        copy.SetIJKToRASMatrix(_vtk_matrix(placed))
+        copy.SetIJKToRASMatrix(vtk_matrix(placed))
         copy.ApplyNonLinearTransform(to_world)
         return copy
     if parent is not None:
         matrix = vtkMatrix4x4()
         parent.GetMatrixTransformToWorld(matrix)
-        placed = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)]) @ placed
+        placed = array_of(matrix) @ placed
     grid = _right_angled(placed)
-    copy.SetIJKToRASMatrix(_vtk_matrix(grid))
+    copy.SetIJKToRASMatrix(vtk_matrix(grid))
     if not np.allclose(grid, placed, rtol=0, atol=1e-4):
         shear = vtkMatrixToLinearTransform()
-        shear.SetInput(_vtk_matrix(placed @ np.linalg.inv(grid)))
+        shear.SetInput(vtk_matrix(placed @ np.linalg.inv(grid)))
         copy.ApplyNonLinearTransform(shear)
     return copy
 

@@ -10,11 +10,12 @@ import numpy as np
 from ..case.meshes import Mesh
 from ..errors import InputError
 from ..geometry.camera import Camera
-from ..geometry.pose import RAS_FROM_LPS, camera_to_ras, inverse, transform
+from ..geometry.pose import RAS_FROM_LPS, camera_to_ras, inverse, ras_from_world, transform
 from ..masks.labels import CLASS_NAMES
 from ..poses.craniotomy import Craniotomy, find_craniotomy
-from .scene import camera_from_pixel
+from .scene import camera_from_pixel, camera_from_slice, fitted_mm_per_px, frame_corners, remove_node
 from .segment_surface import no_surface
+from .vtk_data import image_data, line_polydata, vtk_matrix
 
 FRUSTUMS, LOOKED_THROUGH, MASK = "Sampled cameras", "Camera looked through", "Label map seen"
 MASK_COLOURS = "Label map colours"
@@ -112,7 +113,7 @@ def craniotomy_of_markups(
     points_ras = markup_points_ras(node)
     if not len(points_ras):
         raise InputError(f"{node.GetName()}: holds no point yet; click on the cortex in the 3D view.")
-    points = points_ras if space == "RAS" else transform(RAS_FROM_LPS, points_ras)
+    points = transform(ras_from_world(space), points_ras)  # its own inverse
     if not node.IsA("vtkMRMLMarkupsCurveNode"):
         return find_craniotomy(vessels, cortex, space, points[0], fitted_axis)
     if fitted_axis is None:
@@ -149,12 +150,8 @@ def frustum_polydata(camera: Camera, poses: np.ndarray, lengths_mm: np.ndarray, 
 
     lengths_mm (N,): depth at which the frame of each one is drawn. An extra tick marks the image's upper side.
     """
-    from .scene import _line_polydata
-
-    right, bottom = camera.width - 0.5, camera.height - 0.5
-    middle = (camera.width - 1) / 2
-    corners = [(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)]
-    pixels = np.array([*corners, (middle, -0.5 - 0.12 * camera.height, 0)])
+    tick = ((camera.width - 1) / 2, -0.5 - 0.12 * camera.height, 0)
+    pixels = np.vstack([frame_corners(camera), tick])
     lines = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (1, 5), (5, 2)])
     points_mm, all_lines = [], []
     for pose, length_mm in zip(poses, lengths_mm):
@@ -162,8 +159,8 @@ def frustum_polydata(camera: Camera, poses: np.ndarray, lengths_mm: np.ndarray, 
         all_lines.append(lines + 6 * len(points_mm))
         points_mm.append(transform(camera_to_ras(pose, space), of_camera))
     if not points_mm:
-        return _line_polydata(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
-    return _line_polydata(np.vstack(points_mm), np.vstack(all_lines))
+        return line_polydata(np.zeros((0, 3)), np.zeros((0, 2), np.int64))
+    return line_polydata(np.vstack(points_mm), np.vstack(all_lines))
 
 
 def frustum_lengths_mm(poses: np.ndarray, centre_world_mm: np.ndarray) -> np.ndarray:
@@ -193,26 +190,16 @@ def show_mask(scene, nodes: dict, labels: np.ndarray, camera: Camera, camera_fro
     Returns the vtkMRMLLabelMapVolumeNode; its IJKToRAS, under the transform that `nodes` holds too, puts pixel (u, v)
     where the ray of that pixel meets the plane.
     """
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-
-    from .scene import _vtk_matrix
-
     parent = nodes.get("transform")
     if parent is None or not scene.IsNodePresent(parent):
         parent = nodes["transform"] = _add_hidden(scene, "vtkMRMLLinearTransformNode", LOOKED_THROUGH)
-    parent.SetMatrixTransformToParent(_vtk_matrix(camera_to_ras(camera_from_world, space)))
-    data = vtkImageData()
-    data.SetDimensions(labels.shape[1], labels.shape[0], 1)
-    scalars = numpy_to_vtk(np.ascontiguousarray(labels, np.int16).ravel(), deep=True)
-    scalars.SetName("ImageScalars")
-    data.GetPointData().SetScalars(scalars)
+    parent.SetMatrixTransformToParent(vtk_matrix(camera_to_ras(camera_from_world, space)))
     volume = nodes.get("mask")
     new = volume is None or not scene.IsNodePresent(volume)
     if new:
         volume = nodes["mask"] = _add_hidden(scene, "vtkMRMLLabelMapVolumeNode", MASK)
-    volume.SetIJKToRASMatrix(_vtk_matrix(camera_from_pixel(camera, plane_mm)))
-    volume.SetAndObserveImageData(data)
+    volume.SetIJKToRASMatrix(vtk_matrix(camera_from_pixel(camera, plane_mm)))
+    volume.SetAndObserveImageData(image_data(labels.astype(np.int16)))
     if new:
         display = _new_display(volume, "vtkMRMLLabelMapVolumeDisplayNode")
         display.SetAndObserveColorNodeID(_mask_colours(scene, nodes).GetID())
@@ -223,17 +210,11 @@ def show_mask(scene, nodes: dict, labels: np.ndarray, camera: Camera, camera_fro
 
 def look_at_mask(slice_node, camera: Camera, camera_from_world, plane_mm: float, space: str) -> None:
     """Turn a slice view to the plane on which `show_mask` puts a label map, upright, the whole map in view."""
-    from .scene import _vtk_matrix
-
-    plane_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])  # the slice's y points up, the camera's down
-    # Slice views sample at the corners of their pixels: with this pixel at the origin the map stays sharp.
-    origin = [camera.width / 2, camera.height / 2 - 1, 0, 1]
-    plane_to_camera[:, 3] = camera_from_pixel(camera, plane_mm) @ origin
-    width_mm, height_mm = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
     view_width, view_height = slice_node.GetDimensions()[:2]
-    mm_per_px = max(width_mm / max(view_width, 1), height_mm / max(view_height, 1))
+    mm_per_px = fitted_mm_per_px(slice_node, camera, plane_mm)
+    to_ras = camera_to_ras(camera_from_world, space) @ camera_from_slice(camera, plane_mm)
     modifying = slice_node.StartModify()  # the view answers to each change, else
-    slice_node.GetSliceToRAS().DeepCopy(_vtk_matrix(camera_to_ras(camera_from_world, space) @ plane_to_camera))
+    slice_node.GetSliceToRAS().DeepCopy(vtk_matrix(to_ras))
     slice_node.UpdateMatrices()
     slice_node.SetFieldOfView(mm_per_px * view_width, mm_per_px * view_height, slice_node.GetFieldOfView()[2])
     slice_node.EndModify(modifying)
@@ -241,7 +222,7 @@ def look_at_mask(slice_node, camera: Camera, camera_from_world, plane_mm: float,
 
 def look_onto(camera_node, craniotomy: Craniotomy, space: str) -> None:
     """Put a 3D view's camera over the craniotomy, upright as an upright microscope, looking at its centre."""
-    to_ras = np.eye(3) if space == "RAS" else RAS_FROM_LPS[:3, :3]
+    to_ras = ras_from_world(space)[:3, :3]
     centre, outward, up = (to_ras @ v for v in (craniotomy.centre_world_mm, craniotomy.outward_axis, craniotomy.up))
     camera_node.SetFocalPoint(*centre)
     camera_node.SetPosition(*(centre + LOOKED_FROM_MM * outward))
@@ -265,13 +246,7 @@ def view_direction(camera_from_world: np.ndarray, craniotomy: Craniotomy) -> tup
 def remove_nodes(scene, nodes: dict) -> None:
     """Remove what `nodes` holds from the scene, display and storage nodes included."""
     for node in list(nodes.values()):
-        if node is not None and scene.IsNodePresent(node):
-            displayable = node.IsA("vtkMRMLDisplayableNode")
-            displays = [node.GetNthDisplayNode(i) for i in range(node.GetNumberOfDisplayNodes())] if displayable else []
-            scene.RemoveNode(node)  # first: Slicer's tables look for the display node of a node that is there
-            for display in displays:
-                if display is not None and scene.IsNodePresent(display):
-                    scene.RemoveNode(display)
+        remove_node(scene, node)
     nodes.clear()
 
 

@@ -18,8 +18,9 @@ from ..case.case import Case
 from ..case.meshes import Mesh
 from ..errors import ExpectedAppearancesError, InputError
 from ..geometry.camera import Camera, undistorted
-from ..geometry.pose import RAS_FROM_LPS, camera_to_ras, is_rigid, transform
+from ..geometry.pose import camera_to_ras, is_rigid, ras_from_world, transform
 from ..geometry.silhouette import Silhouette
+from .vtk_data import image_data, line_polydata, vtk_matrix
 
 VESSELS, CORTEX = "Vessels", "Cortex"
 FRAME, FRUSTUM, OUTLINE = "Microscope frame", "Camera frustum", "Predicted outline"
@@ -89,8 +90,7 @@ def add_case_models(scene, case: Case) -> dict:
 def add_case_model(scene, case: Case, name: str):
     """Add one of the case's models, VESSELS or CORTEX, in RAS mm; returns the node."""
     mesh = case.vessels if name == VESSELS else case.cortex
-    ras_from_world = RAS_FROM_LPS if case.space == "LPS" else np.eye(4)
-    in_ras = Mesh(transform(ras_from_world, mesh.vertices_mm), mesh.triangles)
+    in_ras = Mesh(transform(ras_from_world(case.space), mesh.vertices_mm), mesh.triangles)
     node = _add_model(scene, name, in_ras.to_polydata())
     if name == CORTEX:
         node.GetDisplayNode().SetOpacity(0.4)  # vessels below the surface stay visible
@@ -105,7 +105,7 @@ def add_camera_transform(scene, camera_to_ras_matrix: np.ndarray):
 
 
 def set_pose(transform_node, camera_to_ras_matrix: np.ndarray) -> None:
-    transform_node.SetMatrixTransformToParent(_vtk_matrix(camera_to_ras_matrix))
+    transform_node.SetMatrixTransformToParent(vtk_matrix(camera_to_ras_matrix))
 
 
 def add_frame(scene, image_rgb: np.ndarray, camera: Camera, plane_mm: float, parent):
@@ -115,7 +115,7 @@ def add_frame(scene, image_rgb: np.ndarray, camera: Camera, plane_mm: float, par
     Raises InputError when image_rgb is not uint8 (H, W, 3) of the camera's size.
     """
     node = scene.AddNewNodeByClass("vtkMRMLVectorVolumeNode", FRAME)
-    node.SetIJKToRASMatrix(_vtk_matrix(camera_from_pixel(camera, plane_mm)))
+    node.SetIJKToRASMatrix(vtk_matrix(camera_from_pixel(camera, plane_mm)))
     set_frame(node, image_rgb, camera)
     node.CreateDefaultDisplayNodes()
     node.GetDisplayNode().SetAutoWindowLevel(False)
@@ -126,18 +126,8 @@ def add_frame(scene, image_rgb: np.ndarray, camera: Camera, plane_mm: float, par
 
 def set_frame(frame_node, image_rgb: np.ndarray, camera: Camera) -> None:
     """Give the volume new pixels, undistorted where the camera is distorted."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-
     _check_frame(image_rgb, camera)
-    image_rgb = undistorted(image_rgb, camera)
-    data = vtkImageData()
-    data.SetDimensions(camera.width, camera.height, 1)
-    # Row v of the image is row j of the volume: no flip, the top of the frame is j = 0.
-    scalars = numpy_to_vtk(np.ascontiguousarray(image_rgb).reshape(-1, 3), deep=True)
-    scalars.SetName("ImageScalars")
-    data.GetPointData().SetScalars(scalars)
-    frame_node.SetAndObserveImageData(data)
+    frame_node.SetAndObserveImageData(image_data(undistorted(image_rgb, camera)))
 
 
 def camera_from_pixel(camera: Camera, plane_mm: float) -> np.ndarray:
@@ -146,6 +136,41 @@ def camera_from_pixel(camera: Camera, plane_mm: float) -> np.ndarray:
     matrix = np.diag([across, down, (across + down) / 2, 1.0])  # k forward: right-handed with x right, y down
     matrix[:3, 3] = -camera.cx * across, -camera.cy * down, plane_mm
     return matrix
+
+
+def frame_corners(camera: Camera) -> np.ndarray:
+    """(4, 3) px: the outer corners (u, v, 0) of the frame, clockwise from the upper left."""
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    return np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
+
+
+def camera_from_slice(camera: Camera, plane_mm: float) -> np.ndarray:
+    """4x4: a slice's mm -> camera mm, for a slice that lies upright on the plane z = plane_mm, the frame in its middle.
+
+    Slice views sample at the corners of their pixels: with pixel (W / 2, H / 2 - 1) at the origin the frame is sharp.
+    """
+    matrix = np.diag([1.0, -1.0, -1.0, 1.0])  # the slice's y points up, the camera's down
+    matrix[:, 3] = camera_from_pixel(camera, plane_mm) @ [camera.width / 2, camera.height / 2 - 1, 0, 1]
+    return matrix
+
+
+def fitted_mm_per_px(slice_node, camera: Camera, plane_mm: float) -> float:
+    """Size of the view's pixels at which the whole frame on its plane is in view."""
+    view_width, view_height = slice_node.GetDimensions()[:2]
+    width, height = plane_mm * camera.width / camera.fx, plane_mm * camera.height / camera.fy
+    return max(width / max(view_width, 1), height / max(view_height, 1))
+
+
+def remove_node(scene, node) -> None:
+    """With its display nodes, which would stay behind; nothing where it is gone already."""
+    if node is None or not scene.IsNodePresent(node):
+        return
+    displayable = node.IsA("vtkMRMLDisplayableNode")
+    displays = [node.GetNthDisplayNode(i) for i in range(node.GetNumberOfDisplayNodes())] if displayable else []
+    scene.RemoveNode(node)  # first: Slicer's tables look for the display node of a node that is there
+    for display in displays:
+        if display is not None and scene.IsNodePresent(display):
+            scene.RemoveNode(display)
 
 
 def add_frustum(scene, camera: Camera, plane_mm: float, parent):
@@ -161,11 +186,9 @@ def set_frustum(frustum_node, camera: Camera, plane_mm: float) -> None:
 
 
 def _frustum(camera: Camera, plane_mm: float):
-    right, bottom = camera.width - 0.5, camera.height - 0.5
-    corners = np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
-    points_mm = np.vstack([np.zeros(3), transform(camera_from_pixel(camera, plane_mm), corners)])
+    points_mm = np.vstack([np.zeros(3), transform(camera_from_pixel(camera, plane_mm), frame_corners(camera))])
     lines = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])
-    return _line_polydata(points_mm, lines)
+    return line_polydata(points_mm, lines)
 
 
 def add_outline(scene, silhouette: Silhouette, camera_from_world: np.ndarray, plane_mm: float, parent):
@@ -208,7 +231,7 @@ def _check_frame(image_rgb: np.ndarray, camera: Camera) -> None:
 
 
 def _outline(silhouette: Silhouette, camera_from_world: np.ndarray, plane_mm: float):
-    return _line_polydata(*silhouette.on_plane(np.asarray(camera_from_world, float), plane_mm))
+    return line_polydata(*silhouette.on_plane(np.asarray(camera_from_world, float), plane_mm))
 
 
 def _add_model(scene, name: str, polydata, parent=None):
@@ -219,30 +242,3 @@ def _add_model(scene, name: str, polydata, parent=None):
     if parent is not None:
         node.SetAndObserveTransformNodeID(parent.GetID())
     return node
-
-
-def _line_polydata(points_mm: np.ndarray, lines: np.ndarray):
-    """vtkPolyData of points (P, 3) and lines (E, 2), in memory of its own."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-
-    points = vtkPoints()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(points_mm, np.float64), deep=True))
-    cells = vtkCellArray()
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(np.arange(0, 2 * len(lines) + 1, 2, dtype=np.int64), deep=True),
-        numpy_to_vtkIdTypeArray(np.ascontiguousarray(lines.ravel(), np.int64), deep=True),
-    )
-    polydata = vtkPolyData()
-    polydata.SetPoints(points)
-    polydata.SetLines(cells)
-    return polydata
-
-
-def _vtk_matrix(matrix: np.ndarray):
-    from vtkmodules.vtkCommonMath import vtkMatrix4x4
-
-    result = vtkMatrix4x4()
-    result.DeepCopy(np.asarray(matrix, float).ravel().tolist())
-    return result

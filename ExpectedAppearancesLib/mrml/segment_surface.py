@@ -13,6 +13,7 @@ import numpy as np
 
 from ..case.meshes import Mesh
 from ..errors import InputError
+from .vtk_data import array_of
 
 PIECE_VOXELS = 2_000_000
 LABELMAP, SURFACE = "Binary labelmap", "Closed surface"
@@ -51,7 +52,7 @@ class SegmentSurfaces:
             "version": list(version),
             "voxels": str(folder / "voxels.bin"),
             "extent": list(image.GetExtent()),
-            "image_to_world": [matrix.GetElement(i, j) for i in range(4) for j in range(4)],
+            "image_to_world": array_of(matrix).ravel().tolist(),
             "conversion": node.GetSegmentation().SerializeAllConversionParameters(),
             "name": node.GetName(),
         }

@@ -9,6 +9,7 @@ from slicer.i18n import tr as _
 from ..errors import InputError
 from ..mrml.live_align import add_landmark_lists
 from ..mrml.live_controller import LiveController
+from ..mrml.scene import remove_node
 from .labels import set_text
 
 SLIDERS = ("shiftX", "shiftY", "shiftZ", "turnX", "turnY", "turnZ")
@@ -169,10 +170,7 @@ class AlignSection:
             self._stop_picking()
         for node in self._lists or ():
             if node.GetScene() is not None:
-                display = node.GetDisplayNode()
-                node.GetScene().RemoveNode(node)
-                if display is not None and display.GetScene() is not None:
-                    display.GetScene().RemoveNode(display)
+                remove_node(node.GetScene(), node)
         self._lists = self._start = None
         self._moving_sliders = True
         for slider in self._sliders:
