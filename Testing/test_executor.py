@@ -1,4 +1,4 @@
-"""The trainings of a study on the workers of a dask.distributed cluster."""
+"""Jobs, such as the trainings of a study, on the workers of a dask.distributed cluster."""
 
 from __future__ import annotations
 
@@ -68,3 +68,9 @@ def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
     monkeypatch.setattr(executor, "CONNECT_S", 0.5)
     with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
         executor.connect("dask://127.0.0.1:9")
+
+
+@pytest.mark.parametrize("name", ["slurm", "dask://", "dask://host", "dask://host:port"])
+def test_unknown_executors_are_refused(name):
+    with pytest.raises(InputError, match="dask://HOST:PORT"):
+        executor.check_executor(name)

@@ -13,8 +13,7 @@ from cases import texture, write_inputs
 from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.appearances.stage import synthesize_case
 from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.errors import CancelledError, InputError
-from ExpectedAppearancesLib.executor import check_executor
+from ExpectedAppearancesLib.errors import CancelledError
 from ExpectedAppearancesLib.masks.stage import render_case
 
 distributed = pytest.importorskip("distributed")
@@ -122,15 +121,3 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-@pytest.mark.parametrize("executor", ["slurm", "dask://", "dask://host", "dask://host:port"])
-def test_unknown_executors_are_refused(executor):
-    with pytest.raises(InputError, match="dask://HOST:PORT"):
-        check_executor(executor)
-
-
-def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("ExpectedAppearancesLib.executor.CONNECT_S", 1)
-    with pytest.raises(InputError, match=r"127\.0\.0\.1:9"):
-        synthesize(make_case(tmp_path), "dask://127.0.0.1:9")
