@@ -5,7 +5,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/appearances/__init__.py
   ExpectedAppearancesLib/appearances/claims.py
   ExpectedAppearancesLib/appearances/contact_sheet.py
-  ExpectedAppearancesLib/appearances/executors.py
+  ExpectedAppearancesLib/appearances/dispatch.py
   ExpectedAppearancesLib/appearances/gram.py
   ExpectedAppearancesLib/appearances/images.py
   ExpectedAppearancesLib/appearances/lbfgs.py

@@ -19,7 +19,7 @@ from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, read_rendered
 from ..textures.library import Texture
 from . import store
-from .executors import run_shards
+from .dispatch import run_shards
 from .overview import overview_view
 from .shards import Recipe, make_shards
 from .vgg import SHIPPED_WEIGHTS, load_vgg
