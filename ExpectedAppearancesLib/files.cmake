@@ -27,8 +27,6 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/case/__init__.py
   ExpectedAppearancesLib/case/case.py
   ExpectedAppearancesLib/case/meshes.py
-  ExpectedAppearancesLib/case/recorded.py
-  ExpectedAppearancesLib/case/steps.py
   ExpectedAppearancesLib/cli/__init__.py
   ExpectedAppearancesLib/cli/check.py
   ExpectedAppearancesLib/cli/demo.py
@@ -122,6 +120,9 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/mrml/scene.py
   ExpectedAppearancesLib/mrml/segment_surface.py
   ExpectedAppearancesLib/mrml/vtk_data.py
+  ExpectedAppearancesLib/planning/__init__.py
+  ExpectedAppearancesLib/planning/recorded.py
+  ExpectedAppearancesLib/planning/steps.py
   ExpectedAppearancesLib/poses/__init__.py
   ExpectedAppearancesLib/poses/craniotomy.py
   ExpectedAppearancesLib/poses/sampling.py

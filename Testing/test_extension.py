@@ -195,7 +195,7 @@ def test_sample_is_registered_as_slicer_asks():
 
 
 def test_every_planning_step_has_its_section():
-    from ExpectedAppearancesLib.case.steps import STEPS
+    from ExpectedAppearancesLib.planning.steps import STEPS
 
     named = {widget.get("name") for widget in ui_root(MODULE).iter("widget")}
     assert {f"{step}{part}" for step in STEPS for part in ("Section", "Status")} <= named

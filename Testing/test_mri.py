@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.case.steps import StepState
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.planning.steps import StepState
 
 slicer = pytest.importorskip("slicer")
 import vtk  # noqa: E402 (after the skip)

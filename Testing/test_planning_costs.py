@@ -12,8 +12,8 @@ import pytest
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.appearances.overview import overview_view
-from ExpectedAppearancesLib.case import recorded
-from ExpectedAppearancesLib.case.steps import StepState
+from ExpectedAppearancesLib.planning import recorded
+from ExpectedAppearancesLib.planning.steps import StepState
 
 pytest.importorskip("slicer")
 import vtk

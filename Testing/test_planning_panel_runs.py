@@ -58,7 +58,7 @@ for card, options, shown in ((1, ["--device", "auto"], 0), (0, ["--device", "cud
 def test_the_verdict_names_the_test_that_it_rests_on():
     in_the_panel(
         """
-from ExpectedAppearancesLib.case.recorded import Recorded
+from ExpectedAppearancesLib.planning.recorded import Recorded
 from ExpectedAppearancesLib.evaluation.verdict import OWN_VALIDATION, Figures
 panel.recorded = Recorded(verdict=(True, ()))
 loto, own, strict = (Figures(name, "", *[1.0] * 8) for name in ("loto", OWN_VALIDATION, "strict"))
@@ -92,8 +92,8 @@ for module in (planning_qt, system_report, worker):
 def test_a_study_that_would_begin_anew_says_so():
     in_the_panel(
         """
-from ExpectedAppearancesLib.case.recorded import Recorded
-from ExpectedAppearancesLib.case.steps import Study
+from ExpectedAppearancesLib.planning.recorded import Recorded
+from ExpectedAppearancesLib.planning.steps import Study
 validation, p = panel.sections["validation"], panel.parameters
 panel.recorded = Recorded(study=Study.STOPPED, study_preset={"name": p.preset.value, "minutes": p.minutes})
 validation._show_hint(2)

@@ -7,8 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from ExpectedAppearancesLib.case.steps import Step, StepState
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.planning.steps import Step, StepState
 from ExpectedAppearancesLib.runs.worker import Worker
 
 slicer = pytest.importorskip("slicer")

@@ -8,8 +8,8 @@ import cases
 import numpy as np
 import pytest
 
-from ExpectedAppearancesLib.case.steps import StepState
 from ExpectedAppearancesLib.geometry.camera import read_camera
+from ExpectedAppearancesLib.planning.steps import StepState
 from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 
 pytest.importorskip("slicer")

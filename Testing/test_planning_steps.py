@@ -14,8 +14,12 @@ import pytest
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.case.recorded import CaseReader, training_state
-from ExpectedAppearancesLib.case.steps import (
+from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.evaluation import metrics
+from ExpectedAppearancesLib.evaluation.verdict import Limits, figures_of_model, figures_of_study, verdict
+from ExpectedAppearancesLib.model.presets import PRESETS
+from ExpectedAppearancesLib.planning.recorded import CaseReader, training_state
+from ExpectedAppearancesLib.planning.steps import (
     STEPS,
     Chosen,
     Recorded,
@@ -25,10 +29,6 @@ from ExpectedAppearancesLib.case.steps import (
     next_step,
     plan_steps,
 )
-from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.evaluation import metrics
-from ExpectedAppearancesLib.evaluation.verdict import Limits, figures_of_model, figures_of_study, verdict
-from ExpectedAppearancesLib.model.presets import PRESETS
 
 MISSING, READY, RUNNING, STALE, DONE = StepState
 CRANIOTOMY = {"centre_world_mm": [1.0, 2.0, 3.0], "outward_axis": [0.0, 0.0, 1.0], "up": [0.0, 1.0, 0.0]}

@@ -16,14 +16,14 @@ from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.case.recorded import CaseReader
-from ExpectedAppearancesLib.case.steps import Study
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.evaluation import study_frames
 from ExpectedAppearancesLib.evaluation.verdict import Limits
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.masks.stage import craniotomy_of, parenchyma_of, render_case
+from ExpectedAppearancesLib.planning.recorded import CaseReader
+from ExpectedAppearancesLib.planning.steps import Study
 from ExpectedAppearancesLib.registration.poses_file import read_poses
 from ExpectedAppearancesLib.runs import runner
 from ExpectedAppearancesLib.runs.results import result_problem

@@ -21,7 +21,6 @@ from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.appearances import projection, store
 from ExpectedAppearancesLib.appearances.overview import overview_view
 from ExpectedAppearancesLib.case.case import Case
-from ExpectedAppearancesLib.case.recorded import training_state
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.geometry.pose import transform
@@ -41,6 +40,7 @@ from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
 from ExpectedAppearancesLib.model.networks import build_network
 from ExpectedAppearancesLib.model.presets import PRESETS
 from ExpectedAppearancesLib.model.training import train_case
+from ExpectedAppearancesLib.planning.recorded import training_state
 from ExpectedAppearancesLib.poses import sampling
 from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
 from ExpectedAppearancesLib.registration.decoding import cell_pixels

@@ -8,8 +8,8 @@ from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 from ..case.case import MANIFEST_NAME, Case
-from ..case.steps import LENGTH_TOLERANCE_MM
 from ..errors import InputError
+from ..planning.steps import LENGTH_TOLERANCE_MM
 from ..poses.sampling import PoseRanges
 from .mri import scan_of
 from .planning import remove_nodes, same_mesh, world_mesh

@@ -12,11 +12,11 @@ import numpy as np
 
 from ..case.case import Case
 from ..case.meshes import Mesh
-from ..case.recorded import CaseReader
-from ..case.steps import Chosen, Recorded, Step, craniotomy_moved, plan_steps
 from ..errors import InputError, Problems
 from ..evaluation.verdict import Limits
 from ..geometry.camera import Camera, read_camera, write_camera
+from ..planning.recorded import CaseReader
+from ..planning.steps import Chosen, Recorded, Step, craniotomy_moved, plan_steps
 from ..poses.craniotomy import Craniotomy, find_craniotomy, has_own_axis
 from ..poses.sampling import PoseRanges, PoseSampler
 from ..textures.library import list_textures, problems_of_folder, shipped_textures_folder

@@ -7,8 +7,8 @@ import os
 import qt
 from slicer.i18n import tr as _
 
-from ..case.steps import StepState
 from ..gpus import device_arguments
+from ..planning.steps import StepState
 from .planning_run import RunControls, in_the_way, started
 from .planning_section import Section, changed
 

@@ -15,9 +15,9 @@ import slicer
 from slicer.i18n import tr as _
 
 from ..case.case import MANIFEST_NAME
-from ..case.steps import StepState
 from ..errors import InputError
 from ..mrml.mri import keeping_scan
+from ..planning.steps import StepState
 from ..runs.record import refuse_if_occupied
 from .planning_qt import Child, Stepper, allow, library_command, problems_in, quiet
 from .planning_section import NodeWatch, Section, changed

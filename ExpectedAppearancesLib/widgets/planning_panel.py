@@ -12,12 +12,12 @@ import qt
 import slicer
 from slicer.i18n import tr as _
 
-from ..case.recorded import Recorded
-from ..case.steps import STEPS, Step, StepState, next_step
 from ..mrml import planning
 from ..mrml.planning_adopt import adopting
 from ..mrml.planning_session import PlanningSession
 from ..mrml.segment_surface import SegmentSurfaces
+from ..planning.recorded import Recorded
+from ..planning.steps import STEPS, Step, StepState, next_step
 from ..runs.closing import OnClose, close_runs, going_on, question
 from ..runs.runner import loaded_for_runs
 from ..runs.state import RunState, RunStatus

@@ -6,9 +6,9 @@ import numpy as np
 import slicer
 from slicer.i18n import tr as _
 
-from ..case.steps import StepState
 from ..errors import InputError
 from ..mrml import planning
+from ..planning.steps import StepState
 from .planning_look import Looking
 from .planning_qt import Stepper, allow, quiet
 from .planning_run import RunControls, in_the_way, started

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import qt
 
-from ..case.steps import Step, StepState
+from ..planning.steps import Step, StepState
 from ..runs.environment import WITHOUT_WINDOW, environment_of, python_for_runs
 from ..runs.worker import Worker
 from .drawing import DrawnInTurn

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from slicer.i18n import tr as _
 
-from ..case.steps import STEPS, Step, StepState
+from ..planning.steps import STEPS, Step, StepState
 from .planning_qt import SYMBOLS, show_status
 
 

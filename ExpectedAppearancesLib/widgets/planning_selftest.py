@@ -12,9 +12,9 @@ import numpy as np
 import slicer
 
 from .. import files
-from ..case.steps import StepState
 from ..masks.labels import VESSELS
 from ..mrml import charts, labelling, planning
+from ..planning.steps import StepState
 from ..runs import dependencies
 from ..textures.library import LABELS_SUFFIX, read_library, shipped_textures_folder
 from .planning_selftest_tools import (

@@ -7,10 +7,10 @@ import math
 import slicer
 from slicer.i18n import tr as _
 
-from ..case.steps import StepState
 from ..gpus import Gpu, device_arguments
 from ..model.presets import PRESETS
 from ..mrml import charts
+from ..planning.steps import StepState
 from ..runs.state import RunStatus
 from .planning_devices import find_gpus
 from .planning_qt import allow, quiet

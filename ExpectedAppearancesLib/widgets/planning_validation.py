@@ -7,10 +7,10 @@ import html
 import slicer
 from slicer.i18n import tr as _
 
-from ..case.steps import StepState, Study, changes_of_training
 from ..evaluation.verdict import PROTOCOL_NAMES, deciding
 from ..gpus import device_arguments
 from ..mrml import charts
+from ..planning.steps import StepState, Study, changes_of_training
 from .labels import set_text
 from .planning_qt import allow
 from .planning_run import RunControls, in_the_way, started

@@ -10,9 +10,9 @@ from enum import Enum
 
 import numpy as np
 
+from ..case.case import pose_settings
 from ..geometry.camera import Camera
 from ..model.presets import PRESETS
-from .case import pose_settings
 
 STEPS = ("case", "microscope", "poses", "textures", "appearances", "training", "validation")
 FEW_TEXTURES = 6  # fewer teach the network these textures rather than cortex

@@ -14,9 +14,9 @@ import numpy as np
 from .. import files
 from ..appearances import METHODS
 from ..appearances.store import folder_of, index_path, newest_image
+from ..case.case import MANIFEST_NAME, Case
 from ..errors import InputError
 from ..evaluation.verdict import Figures, Limits, figures_of_model, figures_of_study, verdict
-from .case import MANIFEST_NAME, Case
 from .steps import Recorded, Study, drawn_from_elsewhere
 
 STOPPED = ("cancelled", "failed")  # outcomes of a run as its record names them
