@@ -91,7 +91,6 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/masks/stage.py
   ExpectedAppearancesLib/model/__init__.py
   ExpectedAppearancesLib/model/checkpoint.py
-  ExpectedAppearancesLib/model/encoding.py
   ExpectedAppearancesLib/model/export.py
   ExpectedAppearancesLib/model/feeder.py
   ExpectedAppearancesLib/model/fold.py
@@ -132,6 +131,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/registration/covariance.py
   ExpectedAppearancesLib/registration/decoding.py
   ExpectedAppearancesLib/registration/descent.py
+  ExpectedAppearancesLib/registration/encoding.py
   ExpectedAppearancesLib/registration/footage.py
   ExpectedAppearancesLib/registration/pnp.py
   ExpectedAppearancesLib/registration/poses_file.py

@@ -16,8 +16,8 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.pose import look_at
-from ExpectedAppearancesLib.model.encoding import fit_encoding
 from ExpectedAppearancesLib.registration import predictor as predictor_module
+from ExpectedAppearancesLib.registration.encoding import fit_encoding
 from ExpectedAppearancesLib.registration.footage import Footage, read_frame_rgb
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
 from ExpectedAppearancesLib.registration.predictor import Prediction

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from ExpectedAppearancesLib.errors import InputError
 from ExpectedAppearancesLib.geometry.camera import Camera
 from ExpectedAppearancesLib.geometry.pose import geodesic_angle_rad, inverse, pose_from_rotation, transform
-from ExpectedAppearancesLib.model.encoding import PoseEncoding, fit_encoding, network_camera
 from ExpectedAppearancesLib.registration.confidence import calibrate, calibration_error
 from ExpectedAppearancesLib.registration.contrast import ContrastAligner
 from ExpectedAppearancesLib.registration.decoding import PlausibleView, cell_pixels, read_dense
+from ExpectedAppearancesLib.registration.encoding import PoseEncoding, fit_encoding, network_camera
 from ExpectedAppearancesLib.registration.pnp import fit_pose
 from ExpectedAppearancesLib.registration.predictor import FORMAT_VERSION, Predictor, fitted_camera
 from ExpectedAppearancesLib.registration.refinement import VesselAligner

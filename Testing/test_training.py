@@ -34,7 +34,6 @@ from ExpectedAppearancesLib.masks.stage import (
     render_case,
 )
 from ExpectedAppearancesLib.model import checkpoint, training, views
-from ExpectedAppearancesLib.model.encoding import fit_encoding, network_camera
 from ExpectedAppearancesLib.model.feeder import Feeder, draw_views
 from ExpectedAppearancesLib.model.losses import dense_loss, regression_loss
 from ExpectedAppearancesLib.model.networks import build_network
@@ -44,6 +43,7 @@ from ExpectedAppearancesLib.planning.recorded import training_state
 from ExpectedAppearancesLib.poses import sampling
 from ExpectedAppearancesLib.poses.sampling import PoseRanges, PoseSampler
 from ExpectedAppearancesLib.registration.decoding import cell_pixels
+from ExpectedAppearancesLib.registration.encoding import fit_encoding, network_camera
 from ExpectedAppearancesLib.registration.poses_file import write_poses
 from ExpectedAppearancesLib.registration.predictor import Predictor
 from ExpectedAppearancesLib.runs.environment import library_environment

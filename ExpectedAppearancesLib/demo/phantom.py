@@ -18,11 +18,11 @@ from ..case.meshes import Mesh, write_vtp
 from ..geometry.camera import Camera
 from ..geometry.pose import apply_to_vtk_camera, look_at, transform
 from ..masks.exposed import exposed_vessels
-from ..model.encoding import PoseEncoding
 from ..poses.craniotomy import find_craniotomy
 from ..registration.confidence import Confidence
 from ..registration.covariance import CovarianceModel
 from ..registration.decoding import EVIDENCE
+from ..registration.encoding import PoseEncoding
 from ..registration.predictor import EXPOSED_VESSELS_NAME, FORMAT_VERSION
 from .vessel_tree import generate_case_meshes
 

@@ -11,8 +11,8 @@ from .. import files
 from ..appearances.store import index_path, read_appearances
 from ..case.case import Case, pose_settings
 from ..errors import InputError
-from ..model.encoding import network_camera
 from ..model.views import ViewSettings, ViewSource
+from ..registration.encoding import network_camera
 from ..registration.footage import video_and_number
 from ..registration.poses_file import Frame, write_poses
 

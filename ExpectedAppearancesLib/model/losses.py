@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from .encoding import PoseEncoding
+from ..registration.encoding import PoseEncoding
 
 
 def regression_loss(output: torch.Tensor, target: torch.Tensor, encoding: PoseEncoding) -> torch.Tensor:

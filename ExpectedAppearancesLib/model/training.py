@@ -29,10 +29,10 @@ from ..registration.confidence import calibrate, calibration_error
 from ..registration.contrast import SHARPER, ContrastAligner
 from ..registration.covariance import CovarianceModel, calibrate_covariance, correlated, pose_error
 from ..registration.decoding import EVIDENCE, PlausibleView, Reading, read_dense, read_regression
+from ..registration.encoding import PoseEncoding, fit_encoding, network_camera
 from ..registration.predictor import EXPOSED_VESSELS_NAME
 from ..registration.refinement import VesselAligner
 from . import checkpoint
-from .encoding import PoseEncoding, fit_encoding, network_camera
 from .export import export_model
 from .feeder import Batch, Feeder, ViewMemory, draw_views
 from .fold import Fold

@@ -23,7 +23,7 @@ from ..masks.labels import BACKGROUND, VESSELS
 from ..masks.renderer import MaskRenderer
 from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..poses.sampling import PoseSampler
-from .encoding import network_camera
+from ..registration.encoding import network_camera
 from .fold import known_poses, seen_from
 
 COMPOSED_PX = 256  # smaller views are composed at twice their size, then averaged: frames are anti-aliased too

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..geometry.camera import Camera
 from ..geometry.pose import inverse, transform
-from ..model.encoding import PoseEncoding
 from .confidence import logistic
 from .contrast import ContrastAligner
+from .encoding import PoseEncoding
 from .pnp import PoseFit, fit_pose
 from .refinement import VesselAligner
 

@@ -14,11 +14,11 @@ from ..case.case import Case
 from ..case.meshes import read_mesh
 from ..errors import InputError
 from ..geometry.camera import Camera
-from ..model.encoding import PoseEncoding, network_camera
 from .confidence import Confidence
 from .contrast import SHARPER, ContrastAligner
 from .covariance import CovarianceModel
 from .decoding import PlausibleView, read_dense, read_regression
+from .encoding import PoseEncoding, network_camera
 from .refinement import VesselAligner
 
 FORMAT_VERSION = 4  # 4: poses are sought farther off on the frame itself, and confidence was calibrated on that
