@@ -21,9 +21,9 @@ def node_with(scene, image):
 
 
 def send(node, image):
-    from ExpectedAppearancesLib.mrml.live_scene import _set_image
+    from ExpectedAppearancesLib.mrml.vtk_data import set_image
 
-    _set_image(node, image)
+    set_image(node, image)
 
 
 def choice_of(phantom, **values) -> Choice:

@@ -276,10 +276,10 @@ def test_view_through_the_camera_has_the_frame_behind_the_vessels(application, c
     assert np.abs(pixels.astype(int) - result.image_rgb)[5:-5, 5:-5].mean() < 2
     assert (other.pixels() == [0, 255, 0]).all()
     # A recording that is looked at gives the frame an image of its own.
-    from ExpectedAppearancesLib.mrml.live_scene import _set_image
+    from ExpectedAppearancesLib.mrml.vtk_data import set_image
 
     live.frame.SetAndObserveImageData(None)
-    _set_image(live.frame, np.ascontiguousarray(result.image_rgb[:, ::-1]))
+    set_image(live.frame, np.ascontiguousarray(result.image_rgb[:, ::-1]))
     live.show_backdrop(view.node.GetID())
     assert np.abs(view.pixels().astype(int) - result.image_rgb[:, ::-1])[5:-5, 5:-5].mean() < 2
     live.show(result_of(case, accepted=False))

@@ -9,7 +9,7 @@ from ..geometry.pose import inverse, ras_from_world, transform
 from ..live.alignment import LandmarkPose, pose_from_landmarks
 from . import scene as scenes
 from .live_nodes import ROLE_ATTRIBUTE
-from .live_scene import LiveScene, matrix_of
+from .live_scene import LiveScene
 
 HANDLES, FRAME_LANDMARKS, MESH_LANDMARKS = "handles", "landmarks in frame", "landmarks on mesh"
 
@@ -49,7 +49,7 @@ class Alignment:
     @property
     def camera_from_world(self) -> np.ndarray:
         """The pose at which the camera would see the vessels as they lie now."""
-        moved_from_ras = matrix_of(self.handles)
+        moved_from_ras = scenes.matrix_of(self.handles)
         world_from_ras = inverse(self._ras_from_world)
         return self._start @ world_from_ras @ moved_from_ras @ self._ras_from_world
 

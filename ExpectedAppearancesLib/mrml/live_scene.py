@@ -17,7 +17,7 @@ from ..live.overlay import Overlay
 from ..live.session import LiveResult
 from . import scene as scenes
 from .live_nodes import ROLE_ATTRIBUTE, mark, node_of_role, remove_live_nodes
-from .vtk_data import array_of, image_data, line_polydata, vtk_matrix
+from .vtk_data import line_polydata, set_image, vtk_matrix
 
 FIRST_PLANE_MM = 200.0  # where the frame is put up before any pose says how far the vessels are
 PLANE_CHANGE = 0.1  # share by which the vessels' depth may leave the plane before the plane follows
@@ -66,7 +66,7 @@ class LiveScene:
         if self.transform is None:
             self.transform = mark(scenes.add_camera_transform(scene, self.camera_to_ras), TRANSFORM)
         else:
-            self.camera_to_ras = matrix_of(self.transform)
+            self.camera_to_ras = scenes.matrix_of(self.transform)
         self.frame = node_of_role(scene, FRAME)
         self._aside, self._is_aside = self._add_aside(), False
         self.frustum = None
@@ -121,7 +121,7 @@ class LiveScene:
     @property
     def camera_to_world(self) -> np.ndarray:
         """Camera mm to what the views show: RAS, moved as the case's models are where they hang under a transform."""
-        return matrix_of(self.transform, to_world=True)
+        return scenes.matrix_of(self.transform, to_world=True)
 
     @property
     def picture_to_world(self) -> np.ndarray:
@@ -261,7 +261,7 @@ class LiveScene:
         if self._backdrop_of != (self.camera, self.plane_mm):
             self._backdrop_of = (self.camera, self.plane_mm)
             behind_mm = self.plane_mm + 3 * self._case.vessels.radius_mm
-            self.backdrop.SetAndObservePolyData(_textured_frame(self.camera, behind_mm))
+            self.backdrop.SetAndObservePolyData(scenes.textured_frame(self.camera, behind_mm))
         _set_visible(self.backdrop, self.vessels_visible)
 
     def close(self) -> None:
@@ -297,7 +297,7 @@ class LiveScene:
         was_modifying = self.frame.StartModify()
         if changed:
             self._place_frame()
-        _set_image(self.frame, image_rgb)
+        set_image(self.frame, image_rgb)
         self.frame.EndModify(was_modifying)
 
     def _place_frame(self) -> None:
@@ -308,7 +308,7 @@ class LiveScene:
         """The filled vessels, or an empty layer while they are not to be seen. Taken off a view and put on again, the
         layer would have Slicer write the view's annotations anew: 100 ms."""
         filled = self._filled if self.overlay_visible else np.zeros_like(self._filled)
-        _set_image(self.fill, filled[..., None])
+        set_image(self.fill, filled[..., None])
 
     def _place_fill(self, camera: Camera) -> None:
         small = camera.resized(*self.fill.GetImageData().GetDimensions()[:2])
@@ -357,7 +357,7 @@ class LiveScene:
     def _add_fill(self):
         colours = self._scene.AddNode(_colour_table())
         node = mark(self._scene.AddNewNodeByClass("vtkMRMLLabelMapVolumeNode", "Predicted vessels"), FILL)
-        _set_image(node, self._filled[..., None])
+        set_image(node, self._filled[..., None])
         node.CreateDefaultDisplayNodes()
         node.GetDisplayNode().SetAndObserveColorNodeID(colours.GetID())
         node.SetAndObserveTransformNodeID(self.transform.GetID())
@@ -374,59 +374,10 @@ def _aside_matrix() -> np.ndarray:
     return matrix
 
 
-def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
-    """4x4 of a linear transform node, to its parent or to the world."""
-    from vtkmodules.vtkCommonMath import vtkMatrix4x4
-
-    matrix = vtkMatrix4x4()
-    if to_world:
-        transform_node.GetMatrixTransformToWorld(matrix)
-    else:
-        transform_node.GetMatrixTransformToParent(matrix)
-    return array_of(matrix)
-
-
 def _set_visible(model, visible: bool) -> None:
     display = model.GetDisplayNode()
     if display is not None and bool(display.GetVisibility()) != visible:
         display.SetVisibility(visible)
-
-
-def _set_image(volume, image: np.ndarray) -> None:
-    """New pixels uint8 (H, W, C) for a volume of one slice: into its own memory where the size is the same."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    height, width, components = image.shape
-    data = volume.GetImageData()
-    scalars = data.GetPointData().GetScalars() if data is not None else None
-    same = scalars is not None and data.GetDimensions() == (width, height, 1)
-    if same and scalars.GetNumberOfComponents() == components and scalars.GetDataTypeSize() == 1:
-        vtk_to_numpy(scalars).reshape(-1, components)[:] = image.reshape(-1, components)
-        scalars.Modified()
-        data.Modified()
-        return
-    volume.SetAndObserveImageData(image_data(image))
-
-
-def _textured_frame(camera: Camera, depth_mm: float):
-    """vtkPolyData: the frame's outer edges at that depth in camera mm, with texture coordinates."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-
-    plane = scenes.camera_from_pixel(camera, depth_mm)
-    points = vtkPoints()
-    points.SetData(numpy_to_vtk(scenes.frame_corners(camera) @ plane[:3, :3].T + plane[:3, 3], deep=True))
-    cells = vtkCellArray()
-    cells.InsertNextCell(4, range(4))
-    polydata = vtkPolyData()
-    polydata.SetPoints(points)
-    polydata.SetPolys(cells)
-    # Row 0 of the frame is the first row of the texture: v grows downwards, as in the frame.
-    coordinates = numpy_to_vtk(np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32), deep=True)
-    coordinates.SetName("TextureCoordinates")
-    polydata.GetPointData().SetTCoords(coordinates)
-    return polydata
 
 
 def _colour_table():

@@ -20,7 +20,7 @@ from ..errors import ExpectedAppearancesError, InputError
 from ..geometry.camera import Camera, undistorted
 from ..geometry.pose import camera_to_ras, is_rigid, ras_from_world, transform
 from ..geometry.silhouette import Silhouette
-from .vtk_data import image_data, line_polydata, vtk_matrix
+from .vtk_data import array_of, image_data, line_polydata, vtk_matrix
 
 VESSELS, CORTEX = "Vessels", "Cortex"
 FRAME, FRUSTUM, OUTLINE = "Microscope frame", "Camera frustum", "Predicted outline"
@@ -108,6 +108,18 @@ def set_pose(transform_node, camera_to_ras_matrix: np.ndarray) -> None:
     transform_node.SetMatrixTransformToParent(vtk_matrix(camera_to_ras_matrix))
 
 
+def matrix_of(transform_node, to_world: bool = False) -> np.ndarray:
+    """4x4 of a linear transform node, to its parent or to the world."""
+    from vtkmodules.vtkCommonMath import vtkMatrix4x4
+
+    matrix = vtkMatrix4x4()
+    if to_world:
+        transform_node.GetMatrixTransformToWorld(matrix)
+    else:
+        transform_node.GetMatrixTransformToParent(matrix)
+    return array_of(matrix)
+
+
 def add_frame(scene, image_rgb: np.ndarray, camera: Camera, plane_mm: float, parent):
     """Add the vector volume 'Microscope frame' on the plane z = plane_mm of the camera, under the transform `parent`.
 
@@ -142,6 +154,27 @@ def frame_corners(camera: Camera) -> np.ndarray:
     """(4, 3) px: the outer corners (u, v, 0) of the frame, clockwise from the upper left."""
     right, bottom = camera.width - 0.5, camera.height - 0.5
     return np.array([(-0.5, -0.5, 0), (right, -0.5, 0), (right, bottom, 0), (-0.5, bottom, 0)])
+
+
+def textured_frame(camera: Camera, depth_mm: float):
+    """vtkPolyData: the frame's outer edges at that depth in camera mm, with texture coordinates."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    plane = camera_from_pixel(camera, depth_mm)
+    points = vtkPoints()
+    points.SetData(numpy_to_vtk(frame_corners(camera) @ plane[:3, :3].T + plane[:3, 3], deep=True))
+    cells = vtkCellArray()
+    cells.InsertNextCell(4, range(4))
+    polydata = vtkPolyData()
+    polydata.SetPoints(points)
+    polydata.SetPolys(cells)
+    # Row 0 of the frame is the first row of the texture: v grows downwards, as in the frame.
+    coordinates = numpy_to_vtk(np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32), deep=True)
+    coordinates.SetName("TextureCoordinates")
+    polydata.GetPointData().SetTCoords(coordinates)
+    return polydata
 
 
 def camera_from_slice(camera: Camera, plane_mm: float) -> np.ndarray:

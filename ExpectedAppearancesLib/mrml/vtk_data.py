@@ -34,6 +34,22 @@ def image_data(pixels: np.ndarray):
     return data
 
 
+def set_image(volume, image: np.ndarray) -> None:
+    """New pixels uint8 (H, W, C) for a volume of one slice: into its own memory where the size is the same."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    height, width, components = image.shape
+    data = volume.GetImageData()
+    scalars = data.GetPointData().GetScalars() if data is not None else None
+    same = scalars is not None and data.GetDimensions() == (width, height, 1)
+    if same and scalars.GetNumberOfComponents() == components and scalars.GetDataTypeSize() == 1:
+        vtk_to_numpy(scalars).reshape(-1, components)[:] = image.reshape(-1, components)
+        scalars.Modified()
+        data.Modified()
+        return
+    volume.SetAndObserveImageData(image_data(image))
+
+
 def line_polydata(points_mm: np.ndarray, lines: np.ndarray):
     """vtkPolyData of points (P, 3) and lines (E, 2), in memory of its own."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray

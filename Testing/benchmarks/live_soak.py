@@ -93,8 +93,8 @@ def soak(frames: int, minutes: float | None = None, rate_hz: float = 0.0) -> dic
 
 def _is_wrong(controller, status, poses, images, covered) -> bool:
     """Whether pixels, pose, transform and visibility on the screen belong to different frames."""
-    from ExpectedAppearancesLib.mrml.live_scene import matrix_of
     from ExpectedAppearancesLib.mrml.live_stream import pixels_of
+    from ExpectedAppearancesLib.mrml.scene import matrix_of
 
     pixels = pixels_of(controller.live.frame.GetImageData())
     number = status.result.frame.number
