@@ -1,4 +1,4 @@
-"""The class-wise Gram loss of S_Theta (the paper's synthesis equation), for a batch of images."""
+"""The class-wise Gram loss of S_Theta (L_Theta: paper, equation 2), for a batch of images."""
 
 from __future__ import annotations
 

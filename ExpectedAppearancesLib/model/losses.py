@@ -9,7 +9,7 @@ from ..registration.encoding import PoseEncoding
 
 
 def regression_loss(output: torch.Tensor, target: torch.Tensor, encoding: PoseEncoding) -> torch.Tensor:
-    """The paper's L_Omega: ||t - t^|| (mm) + ||r - r^|| (rad), mean over the batch; output and target (B, 6)."""
+    """L_Omega (paper, equation 3): ||t - t^|| (mm) + ||r - r^|| (rad), mean over the batch. Both (B, 6)."""
     translation = (output[:, 3:] - target[:, 3:]) * encoding.translation_scale_mm
     return (translation.norm(dim=1) + (output[:, :3] - target[:, :3]).norm(dim=1)).mean()
 

@@ -8,7 +8,8 @@ from torch import nn
 
 
 class PaperRegressor(nn.Module):
-    """The paper's P_Omega: 3 blocks of (conv, conv, ReLU), average pooling after all but the last, then 128-64-32-6."""
+    """P_Omega (paper, section 2.3): 3 blocks of (conv, conv, ReLU), average pooling after all but the last, then
+    128-64-32-6."""
 
     def __init__(self, size_px: int, inputs: int = 3):
         super().__init__()
