@@ -124,6 +124,7 @@ class ExpectedAppearancesParameterNode:
     cortexModel: vtkMRMLModelNode
     mriVolume: vtkMRMLScalarVolumeNode
     casePath: str = ""
+    savedCasePath: str = ""  # the folder, once it has held a case: where that is gone, it is missed
 
     cameraSource: CameraSource = CameraSource.FILE
     calibrationPath: str = ""
