@@ -193,6 +193,7 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         self.addObserver(scene, scene.StartCloseEvent, self.onSceneStartClose)
         self.addObserver(scene, scene.EndCloseEvent, self.onSceneEndClose)
         self.addObserver(scene, scene.EndImportEvent, self.onSceneEndImport)
+        self.addObserver(scene, scene.NodeAboutToBeRemovedEvent, self.onNodeGoes)
         slicer.app.connect("aboutToQuit()", self.onQuit)
         self.initializeParameterNode()
         if self.parent.isEntered:  # reloaded while it was shown
@@ -229,6 +230,10 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
 
     def onSceneEndImport(self, _caller, _event):
         self.initializeParameterNode()
+
+    @vtk.calldata_type(vtk.VTK_OBJECT)
+    def onNodeGoes(self, _caller, _event, node):
+        self.panel.let_go(node)
 
     def onQuit(self):
         self.panel.quitting()

@@ -43,6 +43,7 @@ SECTIONS = (
     TrainingSection,
     ValidationSection,
 )
+SELECTORS = ("vesselsSelector", "cortexSelector", "mriSelector", "craniotomySelector")
 SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training", "study": "validation"}
 
 
@@ -116,6 +117,12 @@ class PlanningPanel:
         for section in self.sections.values():
             section.close()
         self.help.close()
+
+    def let_go(self, node) -> None:
+        """Before a node is removed: Slicer's selectors would choose another in its place, the cortex as vessels."""
+        for selector in (getattr(self.ui, name) for name in SELECTORS):
+            if selector.currentNode() == node:
+                selector.setCurrentNode(None)
 
     def refresh_soon(self) -> None:
         """Refresh once after a burst of changes."""
