@@ -124,6 +124,7 @@ class ExpectedAppearancesParameterNode:
     cortexModel: vtkMRMLModelNode
     mriVolume: vtkMRMLScalarVolumeNode
     casePath: str = ""
+    savedCasePath: str = ""  # the folder, once it has held a case: where that is gone, it is missed
 
     cameraSource: CameraSource = CameraSource.FILE
     calibrationPath: str = ""
@@ -192,6 +193,7 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
         self.addObserver(scene, scene.StartCloseEvent, self.onSceneStartClose)
         self.addObserver(scene, scene.EndCloseEvent, self.onSceneEndClose)
         self.addObserver(scene, scene.EndImportEvent, self.onSceneEndImport)
+        self.addObserver(scene, scene.NodeAboutToBeRemovedEvent, self.onNodeGoes)
         slicer.app.connect("aboutToQuit()", self.onQuit)
         self.initializeParameterNode()
         if self.parent.isEntered:  # reloaded while it was shown
@@ -228,6 +230,10 @@ class ExpectedAppearancesWidget(ScriptedLoadableModuleWidget, VTKObservationMixi
 
     def onSceneEndImport(self, _caller, _event):
         self.initializeParameterNode()
+
+    @vtk.calldata_type(vtk.VTK_OBJECT)
+    def onNodeGoes(self, _caller, _event, node):
+        self.panel.let_go(node)
 
     def onQuit(self):
         self.panel.quitting()

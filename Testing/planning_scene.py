@@ -80,6 +80,7 @@ def parameters(**values) -> SimpleNamespace:
         preset=Preset.QUICK,
         minutes=26.0,
         mriVolume=None,
+        savedCasePath="",
         acceptedAddLimitMm=1.5,
         acceptedLimitPercent=30.0,
     )

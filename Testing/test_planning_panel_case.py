@@ -190,6 +190,23 @@ for folder, enabled in (("case", False), (sys.argv[2], True)):
     )
 
 
+def test_a_case_that_was_moved_is_missed_in_a_saved_scene_and_not_saved_anew(tmp_path):
+    """Hours of training lie in the folder that was renamed: a new case in its old place has none of it."""
+    in_the_panel(
+        """
+panel.session.mesh = lambda p, name: None
+p, ui = panel.parameters, panel.ui
+p.vesselsNode, ui.saveCaseButton.enabled = MagicMock(), True
+p.casePath = p.savedCasePath = sys.argv[2]  # as the scene says
+panel.refresh()
+assert "open the case where it is now" in panel.steps["case"].text and not ui.saveCaseButton.enabled
+panel.open_folder(sys.argv[2])  # New, of the same name
+assert "is not there" not in panel.steps["case"].text and ui.saveCaseButton.enabled
+""",
+        tmp_path / "case",
+    )
+
+
 def test_runs_of_the_cases_that_were_open_before_are_ended_with_the_scene_too(tmp_path):
     in_the_panel(
         """

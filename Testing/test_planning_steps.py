@@ -193,6 +193,20 @@ def test_what_rests_on_an_outdated_step_is_outdated():
     assert "the poses" in plan_steps(replace(chosen, poses=STEEPER), recorded)["training"].text
 
 
+def test_a_step_that_waits_for_one_before_it_does_not_ask_to_be_started():
+    """Its button is off: a sign that says that all is there would send the planner to it."""
+    chosen, recorded = finished()
+    untrained, unmade = without(recorded, "train"), replace(without(recorded, "train"), index=None)
+    for change, record, step, words in (
+        ({"changed": ("vessel model",)}, without(unmade, "render"), "poses", "the case"),
+        ({"poses": STEEPER}, unmade, "appearances", "the poses"),
+        ({"textures_problem": "a.png: no labels"}, unmade, "appearances", "textures"),
+        ({"synthesis": {"size_px": 256}}, untrained, "training", "the expected appearances"),
+    ):
+        found = plan_steps(replace(chosen, **change), record)[step]
+        assert (found.state, words in found.text) == (MISSING, True), found
+
+
 def test_a_stopped_training_begins_anew_with_other_settings_and_says_so():
     chosen, recorded = finished()
     recorded = with_stage(replace(recorded, steps_trained=70), "train", done=False)
@@ -428,8 +442,8 @@ def test_a_case_that_is_moved_while_it_is_open_is_told(case):
     reader, folder = CaseReader(), case.folder
     assert reader.case(str(folder))[0]
     folder.rename(folder.with_name("elsewhere"))
-    assert "open the case where it is now" in reader.case(str(folder))[1]
-    assert reader.case(str(folder.with_name("new"))) == (None, "")
+    assert "open the case where it is now" in reader.case(str(folder), saved=True)[1]
+    assert reader.case(str(folder)) == (None, "")  # New, of the same name
     folder.with_name("elsewhere").rename(folder)
     assert reader.case(str(folder))[0]
 

@@ -244,7 +244,8 @@ class PlanningSession:
         )
 
     def recorded(self, parameters) -> Recorded:
-        return self.reader.recorded(parameters.casePath, parameters.method.value, self.limits(parameters))
+        p = parameters
+        return self.reader.recorded(p.casePath, p.method.value, self.limits(p), p.casePath == p.savedCasePath)
 
     def steps(
         self, parameters, running: frozenset[str] = frozenset(), recorded: Recorded | None = None

@@ -31,14 +31,16 @@ class CaseReader:
         self._case: Case | None = None
         self._overview: tuple = (None, False)  # what `overview_changed` depends on, its answer
 
-    def case(self, folder: str) -> tuple[Case | None, str]:
-        """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet."""
+    def case(self, folder: str, saved: bool = False) -> tuple[Case | None, str]:
+        """The case and ''; None and what is wrong with the folder; None and '' where there is no case yet.
+
+        saved: there was a case before, so that it is missed.
+        """
         path = Path(folder) / MANIFEST_NAME
         if not folder or not os.path.isfile(path):  # unlike pathlib's, False on a network drive that is gone
-            # A scene from another computer, a drive taken away, or a case that was here a moment ago.
-            known = self._case and self._case.folder == path.parent
+            # A scene from another computer, a drive taken away, or a folder that was moved.
             # On Linux a folder of Windows is a name without a place.
-            gone = folder and (known or not path.is_absolute() or not os.path.isdir(path.parent.parent))
+            gone = folder and (saved or not path.is_absolute() or not os.path.isdir(path.parent.parent))
             text = f"{folder}: is not there. Connect its drive, open the case where it is now, or choose New."
             return None, text if gone else ""
         case, problem = self._once(path, self._open)
@@ -46,9 +48,9 @@ class CaseReader:
             self._kept.pop((str(path), self._open.__name__), None)
         return case, problem
 
-    def recorded(self, folder: str, method: str, limits: Limits) -> Recorded:
-        """All that the steps of the case depend on; `method` is that of the appearances."""
-        case, problem = self.case(folder)
+    def recorded(self, folder: str, method: str, limits: Limits, saved: bool = False) -> Recorded:
+        """All that the steps of the case depend on; `method` is that of the appearances. saved: see `case`."""
+        case, problem = self.case(folder, saved)
         if case is None:
             return Recorded(problem=problem)
         index, index_sha256 = self._once(index_path(case, method), _read_index) or (None, "")

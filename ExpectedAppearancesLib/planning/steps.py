@@ -106,7 +106,7 @@ class Recorded:
 
 
 def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
-    """State of each of STEPS. A step whose predecessor is outdated is outdated too, and says which."""
+    """State of each of STEPS. A step whose predecessor is outdated is outdated too, or waits for it, and says which."""
     steps = {
         "case": _case(chosen, recorded),
         "microscope": _microscope(chosen, recorded),
@@ -123,6 +123,8 @@ def plan_steps(chosen: Chosen, recorded: Recorded) -> dict[str, Step]:
         step = steps[name]
         if step.state is StepState.DONE and before and name not in ("microscope", "textures"):
             steps[name] = Step(StepState.STALE, f"Outdated: {names[before[0]]} changed, see above.")
+        if step.state is StepState.READY and before and name in ("poses", "appearances", "training"):
+            steps[name] = Step(StepState.MISSING, f"First {names[before[0]]}, see above.")
         if steps[name].state is not StepState.DONE and name in names and not (name == "case" and chosen.waiting):
             before.append(name)
     return steps
@@ -266,7 +268,7 @@ def _appearances(chosen: Chosen, recorded: Recorded) -> Step:
         return Step(StepState.MISSING, "Draw the label maps first (Craniotomy and poses).")
     index = recorded.index
     if not index:
-        if not chosen.textures:
+        if not chosen.textures or chosen.textures_problem:
             return Step(StepState.MISSING, "Choose textures first.")
         return Step(StepState.READY, "All is there: start.")
     changed = []

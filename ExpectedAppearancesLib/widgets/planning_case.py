@@ -69,7 +69,7 @@ class CaseSection(Section):
             reason = _("A run is going on in this case; wait until it has ended, or cancel it.")
         elif not folder:
             reason = _("Choose a folder for the case with New.")
-        elif not (os.path.isabs(folder) and os.path.isdir(Path(folder).parent)):
+        elif self.panel.recorded.problem and not os.path.isfile(Path(folder) / MANIFEST_NAME):  # it is missed there
             reason = self.step.text
         elif p.vesselsNode is None and self.session.case(p) is None:
             reason = _("Choose the vessel model first.")

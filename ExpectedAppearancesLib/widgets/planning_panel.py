@@ -27,6 +27,7 @@ from .planning_help import HelpSection
 from .planning_poses import PosesSection
 from .planning_qt import Asking, Stepper, quiet, single_shot
 from .planning_run import RunWatch
+from .planning_section import changed
 from .planning_textures import TexturesSection
 from .planning_training import TrainingSection
 from .planning_validation import ValidationSection
@@ -42,6 +43,7 @@ SECTIONS = (
     TrainingSection,
     ValidationSection,
 )
+SELECTORS = ("vesselsSelector", "cortexSelector", "mriSelector", "craniotomySelector")
 SECTION_OF_KIND = {"render": "poses", "synthesize": "appearances", "train": "training", "study": "validation"}
 
 
@@ -116,6 +118,12 @@ class PlanningPanel:
             section.close()
         self.help.close()
 
+    def let_go(self, node) -> None:
+        """Before a node is removed: Slicer's selectors would choose another in its place, the cortex as vessels."""
+        for selector in (getattr(self.ui, name) for name in SELECTORS):
+            if selector.currentNode() == node:
+                selector.setCurrentNode(None)
+
     def refresh_soon(self) -> None:
         """Refresh once after a burst of changes."""
         if self.parameters is not None and not self.opening:
@@ -137,6 +145,8 @@ class PlanningPanel:
         if not self.entered:
             return
         self.recorded = self.session.recorded(self.parameters)
+        if self.recorded.manifest:
+            changed(self.parameters, "savedCasePath", self.parameters.casePath)
         self.steps = self.session.steps(self.parameters, self.running(), self.recorded)
         for section in self.sections.values():
             section.refresh()
@@ -193,7 +203,7 @@ class PlanningPanel:
             next(pieces)  # so that it is said at once
             self._opening.start(pieces)
             return
-        self.parameters.casePath = folder
+        self.parameters.casePath, self.parameters.savedCasePath = folder, ""
         self.refresh()
         self.unfold(self._next)
 

@@ -71,6 +71,19 @@ def test_case_is_saved_in_world_coordinates(test) -> None:
         test.assertIn("vessel model", panel.steps["case"].text)
 
 
+def test_a_model_that_is_deleted_is_not_replaced_by_another(test) -> None:
+    with Folder() as folder:
+        panel, node = panel_with_models(folder)
+        p, scan = panel.parameters, slicer.util.addVolumeFromArray(np.zeros((2, 2, 2)))
+        slicer.util.addVolumeFromArray(np.zeros((2, 2, 2)))
+        panel.ui.mriSelector.setCurrentNode(scan)
+        for name, chosen in (("vesselsNode", node), ("cortexModel", p.cortexModel), ("mriVolume", scan)):
+            slicer.util.loadModel(str(folder / "Vessels.vtp"))
+            slicer.mrmlScene.RemoveNode(chosen)
+            let_events_pass(0.2)
+            test.assertIsNone(getattr(p, name), name)
+
+
 def test_scan_is_saved_with_the_case_and_found_again(test) -> None:
     with Folder() as folder:
         panel, _node = panel_with_models(folder)
