@@ -47,10 +47,11 @@ def show_training(scene, curve: Sequence[dict]):
         series.SetXColumnName("Step")
         series.SetYColumnName(title)
         series.SetPlotType(series.PlotTypeScatter)
-        series.SetLineStyle(series.LineStyleSolid if len(points) > 1 else series.LineStyleNone)
+        series.SetLineStyle(series.LineStyleSolid)
         series.SetMarkerStyle(series.MarkerStyleCircle if len(points) < 40 else series.MarkerStyleNone)
         series.SetColor(*colour)
-        series_nodes.append(series)
+        if len(points) > 1:  # VTK complains of a shorter line each time it draws, and Slicer shows its sign of an error
+            series_nodes.append(series)
     return _chart(scene, "training.chart", "Training", "Training step", "ADD (mm), loss", series_nodes)
 
 

@@ -128,6 +128,9 @@ class CaseSection(Section):
         if node is not None and self.parameters is not None and not self.panel.loading:
             self._showing.start(shown_in_slices(node))
 
+    def show_scan(self) -> None:
+        self._showing.start(self.showing_scan())
+
     def showing_scan(self, before=None) -> Iterator[None]:
         """Show the MRI of a case that was opened, a view at each step, or at least not `before`, another case's."""
         if self.parameters.mriVolume:

@@ -34,7 +34,7 @@ class Labelling:
         ui = self.ui
         ui.editLabelsButton.connect("clicked(bool)", lambda _checked=False: self.edit())
         ui.useLabelsButton.connect("clicked(bool)", lambda _checked=False: self.save())
-        ui.dropLabelsButton.connect("clicked(bool)", lambda _checked=False: self.stop())
+        ui.dropLabelsButton.connect("clicked(bool)", lambda _checked=False: self.finish())
 
     @property
     def reason(self) -> str:
@@ -112,10 +112,17 @@ class Labelling:
     def _saved(self, code: int, output: str) -> None:
         self._child, self._saving = None, False
         if code == 0:
-            self.stop()
+            self.finish()
         else:
             slicer.util.errorDisplay("\n\n".join(problems_in(output)), windowTitle=_("Not saved yet"))
         self.panel.refresh_soon()
+
+    def finish(self) -> None:
+        """`stop`, and turn the slice views from where the photograph was to the scan, which would be seen as a blur."""
+        seen = bool(self.nodes)
+        self.stop()
+        if seen:
+            self.panel.sections["case"].show_scan()
 
     def stop(self) -> None:
         """Forget the photograph and take its nodes out of the scene."""

@@ -247,10 +247,14 @@ def test_photograph_becomes_a_texture(test) -> None:
         panel = open_panel()
         test.assertFalse(panel.ui.addPhotographButton.enabled)
         test.assertFalse(panel.ui.texturesSection.collapsed)  # where the photograph is saved
+        scan = slicer.util.addVolumeFromArray(np.zeros((100, 100, 100)))
+        panel.parameters.mriVolume = scan
         panel.ui.useLabelsButton.click()
         panel.refresh()
         test.assertFalse(panel.ui.useLabelsButton.enabled)  # while it is being saved
         wait_until(test, lambda: labelling_.nodes == {})
+        red = slicer.app.layoutManager().sliceWidget("Red").mrmlSliceNode()
+        wait_until(test, lambda: red.GetFieldOfView()[1] >= 100)  # the scan, not the place where the photograph was
         panel.unfold("textures")
         wait_until(test, lambda: panel.ui.texturesList.count == 2)
         np.testing.assert_array_equal(files.read_label_map(folder / "textures" / f"Foto_1{LABELS_SUFFIX}"), proposed)
