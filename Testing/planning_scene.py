@@ -12,6 +12,8 @@ import vtk
 
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.case.meshes import Mesh
+from ExpectedAppearancesLib.mrml import mri
+from ExpectedAppearancesLib.mrml.planning_adopt import adopting
 
 LPS = np.array([-1.0, -1.0, 1.0])
 
@@ -92,3 +94,20 @@ def save(session, p, folder) -> Case:
     options = session.export_inputs(p, folder / "exported")
     values = dict(zip(options[::2], options[1::2]))
     return Case.create(folder / "case", values["--vessels"], values["--cortex"], values["--camera"], values["--space"])
+
+
+def adopt(session, p, scene, warn=print) -> Case | None:
+    """Open the case at p.casePath, at once."""
+    pieces = adopting(session, p, p.casePath, scene, warn)
+    while True:
+        try:
+            next(pieces)
+        except StopIteration as stop:
+            return stop.value
+
+
+def keep_scan(case: Case, node, identity: dict | None = None):
+    """Save the MRI with the case, at once; returns its path."""
+    for _piece in mri.keeping_scan(case, node, identity or mri.scan_identity(node)):
+        pass
+    return case.folder / mri.FILE_NAME

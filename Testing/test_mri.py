@@ -11,11 +11,10 @@ from ExpectedAppearancesLib.planning.steps import StepState
 
 slicer = pytest.importorskip("slicer")
 import vtk  # noqa: E402 (after the skip)
-from planning_scene import add_transform, parameters, save, turned  # noqa: E402
+from planning_scene import add_transform, adopt, keep_scan, parameters, save, turned  # noqa: E402
 from vtk.util.numpy_support import numpy_to_vtk, vtk_to_numpy  # noqa: E402
 
 from ExpectedAppearancesLib.mrml import mri  # noqa: E402
-from ExpectedAppearancesLib.mrml.planning_adopt import adopt  # noqa: E402
 
 SIZE = (20, 24, 28)
 INSIDE = np.array([7.0, 11.0, 13.0])  # a voxel
@@ -65,7 +64,7 @@ def test_scan_is_kept_in_world_coordinates_and_the_node_stays(scene, case):
     node = volume(scene)
     node.SetAndObserveTransformNodeID(add_transform(scene, turned(), add_transform(scene, turned())).GetID())
     place, count, inputs = seen_at(node), scene.GetNumberOfNodes(), case.manifest["inputs"]
-    path = mri.keep_scan(case, node)
+    path = keep_scan(case, node)
     assert scene.GetNumberOfNodes() == count and node.GetParentTransformNode() is not None
     assert Case.open(case.folder).manifest["inputs"] == inputs  # no stage depends on it
     other = slicer.vtkMRMLScene()
@@ -93,7 +92,7 @@ def test_a_bent_scan_is_resampled(scene, case):
     bend = scene.AddNewNodeByClass("vtkMRMLTransformNode")
     bend.SetAndObserveTransformToParent(spline)
     node.SetAndObserveTransformNodeID(bend.GetID())
-    mri.keep_scan(case, node)
+    keep_scan(case, node)
     read = mri.scan_of(slicer.vtkMRMLScene(), case)
     i, j, k = INSIDE.astype(int)
     assert value_at(read, seen_at(node)) == pytest.approx(voxels(node).reshape(SIZE[::-1])[k, j, i], abs=1)
@@ -109,7 +108,7 @@ def test_a_sheared_scan_is_seen_where_it_was(scene, case):
     shear = np.eye(4)
     shear[0, 1], shear[1, 1], shear[2, 0] = 0.3, 1.2, -0.1
     node.SetAndObserveTransformNodeID(add_transform(scene, shear, add_transform(scene, turned())).GetID())
-    mri.keep_scan(case, node)
+    keep_scan(case, node)
     read = mri.scan_of(slicer.vtkMRMLScene(), case)
     for ijk in (INSIDE, np.add(INSIDE, (3, -4, 5))):
         assert value_at(read, seen_at(node, ijk)) == pytest.approx(200 + ijk @ [10, 7, 4], abs=15)  # half a voxel
@@ -122,7 +121,7 @@ def test_the_panel_saves_a_chosen_scan_and_finds_it_again(scene, planned, case):
     p.mriVolume = volume(scene)
     step = session.steps(p)["case"]
     assert step.state is StepState.DONE and "without the MRI" in step.text  # nothing made from the case is outdated
-    mri.keep_scan(session.case(p), p.mriVolume, session.scan_to_keep(p))
+    keep_scan(session.case(p), p.mriVolume, session.scan_to_keep(p))
     assert session.scan_to_keep(p) is None and session.steps(p)["case"].text == "Saved."
     p.mriVolume.SetAndObserveTransformNodeID(add_transform(scene, turned()).GetID())
     assert session.scan_to_keep(p) is not None  # it lies elsewhere now
@@ -153,9 +152,9 @@ def test_identity_is_taken_once_for_each_change(scene, planned, case, monkeypatc
 def test_what_is_missing_or_damaged_is_told(scene, planned, case):
     session, p = planned
     with pytest.raises(InputError, match="holds no image"):
-        mri.keep_scan(case, scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "empty"))
+        keep_scan(case, scene.AddNewNodeByClass("vtkMRMLScalarVolumeNode", "empty"))
     assert mri.scan_of(scene, case) is None
-    path = mri.keep_scan(case, volume(slicer.vtkMRMLScene()))
+    path = keep_scan(case, volume(slicer.vtkMRMLScene()))
     path.write_bytes(b"NRRD0004\n")
     with pytest.raises(InputError, match=r"mri\.nrrd: the MRI of the case is damaged"):
         mri.scan_of(scene, case)
@@ -187,7 +186,7 @@ def test_the_live_panel_shows_the_scan_of_its_case(scene, case):
     assert mri.scan_to_show(scene, case, None) is None
     chosen = volume(scene, "chosen by the user", 5)
     assert mri.scan_to_show(scene, case, chosen) is chosen
-    mri.keep_scan(case, volume(slicer.vtkMRMLScene()))
+    keep_scan(case, volume(slicer.vtkMRMLScene()))
     found = mri.scan_to_show(scene, case, None)
     assert found.GetName() == "T1"
     assert mri.scan_to_show(scene, case, found) is found and mri.scan_to_show(scene, case, chosen) is chosen

@@ -14,9 +14,9 @@ from ExpectedAppearancesLib.poses.craniotomy import find_craniotomy
 
 pytest.importorskip("slicer")
 import vtk
-from planning_scene import LPS, Source, Where, add_transform, new_scene, parameters, save, turned
+from planning_scene import LPS, Source, Where, add_transform, adopt, new_scene, parameters, save, turned
 
-from ExpectedAppearancesLib.mrml.planning_adopt import adopt, adopting
+from ExpectedAppearancesLib.mrml.planning_adopt import adopting
 
 
 def test_saved_case_is_recognised_and_opened_again(scene, planned, tmp_path):

@@ -61,18 +61,12 @@ def is_scan_of(case: Case, identity: dict) -> bool:
     return _is_known(case, identity) and (case.folder / _entry(case)["file"]).is_file()
 
 
-def keep_scan(case: Case, node, identity: dict | None = None) -> Path:
-    """Write the volume into the case, all transforms applied, and its identity into case.json; returns its path.
-
-    The node itself stays as it is. Raises InputError where the disk is full or the node holds no image.
-    """
-    for _piece in keeping_scan(case, node, identity or scan_identity(node)):
-        pass
-    return case.folder / FILE_NAME
-
-
 def keeping_scan(case: Case, node, identity: dict) -> Iterator[None]:
-    """`keep_scan` a piece at each step. Closed before its end it leaves the case as it was."""
+    """Write the volume into the case, all transforms applied, and its identity into case.json; a piece at each step.
+
+    The node itself stays as it is. Closed before its end it leaves the case as it was. Raises InputError where the disk
+    is full or the node holds no image.
+    """
     path = case.folder / FILE_NAME
     files.require_space(case.folder, node.GetImageData().GetActualMemorySize() / 1024 + 5)
     name = node.GetName()

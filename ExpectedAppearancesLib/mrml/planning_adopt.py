@@ -19,22 +19,13 @@ from .scene import CORTEX, VESSELS, add_case_model
 CASE_ATTRIBUTE = "ExpectedAppearances.CaseInput"
 
 
-def adopt(session: PlanningSession, parameters, scene, warn: Callable[[str], None] = print) -> Case | None:
-    """Take the case at parameters.casePath into scene and panel; None where there is none that can be opened."""
-    pieces = adopting(session, parameters, parameters.casePath, scene, warn)
-    while True:
-        try:
-            next(pieces)
-        except StopIteration as stop:
-            return stop.value
-
-
 def adopting(
     session: PlanningSession, parameters, folder: str, scene, warn: Callable[[str], None]
 ) -> Generator[None, None, Case | None]:
-    """`adopt` of the case in `folder`, a piece at each step. Closed before its end it leaves nothing in the scene.
+    """Take the case in `folder` into scene and panel, a piece at each step; None where none can be opened there.
 
-    warn: called with the text, where the case's MRI is missing or damaged.
+    warn: called with the text, where the case's MRI is missing or damaged. Closed before its end it leaves nothing in
+    the scene.
     """
     case = session.reader.case(folder)[0]
     yield
