@@ -162,7 +162,6 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/textures/thumbnails.py
   ExpectedAppearancesLib/widgets/__init__.py
   ExpectedAppearancesLib/widgets/drawing.py
-  ExpectedAppearancesLib/widgets/labels.py
   ExpectedAppearancesLib/widgets/live_align.py
   ExpectedAppearancesLib/widgets/live_install.py
   ExpectedAppearancesLib/widgets/live_layout.py
@@ -189,6 +188,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/widgets/planning_textures.py
   ExpectedAppearancesLib/widgets/planning_training.py
   ExpectedAppearancesLib/widgets/planning_validation.py
+  ExpectedAppearancesLib/widgets/refreshing.py
   )
 set(EXPECTEDAPPEARANCESLIB_RESOURCES
   ExpectedAppearancesLib/appearances/weights/README.md

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from panels import in_the_panel
 
-from ExpectedAppearancesLib.widgets.labels import set_percent
+from ExpectedAppearancesLib.widgets.refreshing import set_percent
 
 
 def test_what_a_training_told_is_not_shown_for_another_case(tmp_path):

@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..mrml.live_align import add_landmark_lists
 from ..mrml.live_controller import LiveController
 from ..mrml.scene import remove_node
-from .labels import set_text
+from .refreshing import quiet, set_text
 
 SLIDERS = ("shiftX", "shiftY", "shiftZ", "turnX", "turnY", "turnZ")
 
@@ -40,9 +40,8 @@ class AlignSection:
         """Called on every tick: follow the handles, count the landmarks, compare the poses."""
         ui, aligning = self._ui, self._controller.alignment is not None
         if ui.alignButton.checked != aligning:
-            was_blocked = ui.alignButton.blockSignals(True)
-            ui.alignButton.checked = aligning
-            ui.alignButton.blockSignals(was_blocked)
+            with quiet(ui.alignButton):
+                ui.alignButton.checked = aligning
         if not aligning and self._start is not None:
             self._end()
         ui.alignButton.enabled = can_align or aligning

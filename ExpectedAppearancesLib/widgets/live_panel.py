@@ -18,12 +18,12 @@ from ..mrml.mri import scan_to_show
 from ..runs import dependencies
 from . import live_install
 from .drawing import DrawnInTurn
-from .labels import set_text
 from .live_align import AlignSection
 from .live_layout import LayoutSection
 from .live_record import RecordSection
 from .live_source import SourceSection
 from .live_status import StatusSection
+from .refreshing import set_text
 
 TICK_MS = 4
 # Slicer holds Python's lock while it waits for events: only during this pause do the session's threads get it.

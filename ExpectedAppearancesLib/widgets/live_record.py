@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..live.status import Status
 from ..mrml import live_record
 from ..mrml.live_controller import LiveController
-from .labels import set_text
+from .refreshing import quiet, set_text
 
 
 class RecordSection:
@@ -36,9 +36,8 @@ class RecordSection:
             recorder = None
         recording = recorder is not None
         if ui.recordButton.checked != recording:
-            was_blocked = ui.recordButton.blockSignals(True)
-            ui.recordButton.checked = recording
-            ui.recordButton.blockSignals(was_blocked)
+            with quiet(ui.recordButton):
+                ui.recordButton.checked = recording
         ui.recordButton.enabled = can_record or recording
         if recording:
             text = _("● {frames} frames, {mb} MB").format(frames=recorder.frames, mb=round(recorder.mb))
@@ -55,9 +54,8 @@ class RecordSection:
         if ui.replaySlider.maximum != last:
             ui.replaySlider.maximum = last
         if ui.replaySlider.value != browser.GetSelectedItemNumber():
-            was_blocked = ui.replaySlider.blockSignals(True)
-            ui.replaySlider.value = browser.GetSelectedItemNumber()
-            ui.replaySlider.blockSignals(was_blocked)
+            with quiet(ui.replaySlider):
+                ui.replaySlider.value = browser.GetSelectedItemNumber()
         return self._replay(browser)
 
     def close(self) -> None:

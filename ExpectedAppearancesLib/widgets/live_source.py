@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..live.choice import Choice, SourceKind, problems_of
 from ..live.frames import FrameSettings
+from .refreshing import quiet
 
 KINDS = (SourceKind.PATH, SourceKind.DEVICE, SourceKind.NODE)
 
@@ -56,9 +57,8 @@ class SourceSection:
             ui.sourceNodeComboBox.setCurrentNode(p.sourceNode)
         kind = SourceKind(p.sourceKind)
         if ui.kindComboBox.currentIndex != KINDS.index(kind):
-            was_blocked = ui.kindComboBox.blockSignals(True)
-            ui.kindComboBox.currentIndex = KINDS.index(kind)
-            ui.kindComboBox.blockSignals(was_blocked)
+            with quiet(ui.kindComboBox):
+                ui.kindComboBox.currentIndex = KINDS.index(kind)
         for shown, widgets in (
             (kind is SourceKind.PATH, (ui.pathLabel, ui.sourcePathLineEdit)),
             (kind is SourceKind.DEVICE, (ui.deviceLabel, ui.deviceLineEdit)),

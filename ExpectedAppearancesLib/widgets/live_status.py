@@ -8,7 +8,7 @@ from slicer.i18n import tr as _
 
 from ..live.status import Status
 from . import live_texts
-from .labels import set_percent, set_text
+from .refreshing import set_percent, set_text
 
 NUMBERS_S = 0.15  # the numbers are read, not watched: each new text lays out the panel
 

@@ -19,8 +19,9 @@ from ..errors import InputError
 from ..mrml.mri import keeping_scan
 from ..planning.steps import StepState
 from ..runs.record import refuse_if_occupied
-from .planning_qt import Child, Stepper, allow, library_command, problems_in, quiet
+from .planning_qt import Child, Stepper, allow, library_command, problems_in
 from .planning_section import NodeWatch, Section, changed
+from .refreshing import quiet
 
 # Of models, segmentations and the transforms above them.
 NODE_EVENTS = ("ModifiedEvent", slicer.vtkMRMLTransformableNode.TransformModifiedEvent)

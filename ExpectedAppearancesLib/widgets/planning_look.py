@@ -13,8 +13,8 @@ from slicer.i18n import tr as _
 from ..errors import InputError
 from ..masks import asked
 from ..mrml import planning
-from .labels import set_text
 from .planning_qt import Asking, Stepper
+from .refreshing import set_text
 
 PREVIEW_HEIGHT_PX = 320  # a label map of this size is drawn in some 30 ms without a graphics card
 SLICE = "Red"

@@ -25,12 +25,13 @@ from .planning_appearances import AppearancesSection
 from .planning_case import CaseSection, MicroscopeSection
 from .planning_help import HelpSection
 from .planning_poses import PosesSection
-from .planning_qt import Asking, Stepper, quiet, single_shot
+from .planning_qt import Asking, Stepper, single_shot
 from .planning_run import RunWatch
 from .planning_section import changed
 from .planning_textures import TexturesSection
 from .planning_training import TrainingSection
 from .planning_validation import ValidationSection
+from .refreshing import quiet
 
 REFRESH_MS = 30
 OPENING = "The case is being opened."

@@ -10,9 +10,10 @@ from ..errors import InputError
 from ..mrml import planning
 from ..planning.steps import StepState
 from .planning_look import Looking
-from .planning_qt import Stepper, allow, quiet
+from .planning_qt import Stepper, allow
 from .planning_run import RunControls, in_the_way, started
 from .planning_section import NodeWatch, Section, changed
+from .refreshing import quiet
 
 SHOWN_CAMERAS = 40
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import html
 import subprocess
 import tempfile
@@ -16,7 +15,7 @@ from ..planning.steps import Step, StepState
 from ..runs.environment import WITHOUT_WINDOW, environment_of, python_for_runs
 from ..runs.worker import Worker
 from .drawing import DrawnInTurn
-from .labels import set_text
+from .refreshing import set_text
 
 # Readable on light and on dark themes.
 COLOURS = {
@@ -61,17 +60,6 @@ def single_shot(milliseconds: int, action: Callable[[], None]):
     timer.setInterval(milliseconds)
     timer.connect("timeout()", action)
     return timer
-
-
-@contextlib.contextmanager
-def quiet(*widgets) -> Iterator[None]:
-    """Within the block the widgets tell nobody that they changed."""
-    before = [widget.blockSignals(True) for widget in widgets]
-    try:
-        yield
-    finally:
-        for widget, blocked in zip(widgets, before):
-            widget.blockSignals(blocked)
 
 
 class Stepper:

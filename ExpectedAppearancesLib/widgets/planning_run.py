@@ -13,8 +13,8 @@ from ..errors import ExpectedAppearancesError
 from ..runs.record import refuse_if_occupied
 from ..runs.runner import Run
 from ..runs.state import RunState, RunStatus, controls
-from .labels import set_percent, set_text
 from .planning_qt import allow
+from .refreshing import set_percent, set_text
 
 POLL_MS = 500
 START_TEXTS = {"start": "Start", "continue": "Continue", "again": "Make again"}

@@ -23,8 +23,9 @@ from ..textures.library import (
 )
 from .planning_case import OWN_TEXTURES
 from .planning_labelling import Labelling
-from .planning_qt import Child, allow, library_command, quiet
+from .planning_qt import Child, allow, library_command
 from .planning_section import Section, changed
+from .refreshing import quiet
 
 READING_MODULE = "ExpectedAppearancesLib.textures.thumbnails"
 

@@ -13,9 +13,10 @@ from ..mrml import charts
 from ..planning.steps import StepState
 from ..runs.state import RunStatus
 from .planning_devices import find_gpus
-from .planning_qt import allow, quiet
+from .planning_qt import allow
 from .planning_run import RunControls, in_the_way, started
 from .planning_section import Section, changed
+from .refreshing import quiet
 
 
 class TrainingSection(Section):

@@ -11,10 +11,10 @@ from ..evaluation.verdict import PROTOCOL_NAMES, deciding
 from ..gpus import device_arguments
 from ..mrml import charts
 from ..planning.steps import StepState, Study, changes_of_training
-from .labels import set_text
 from .planning_qt import allow
 from .planning_run import RunControls, in_the_way, started
 from .planning_section import Section
+from .refreshing import set_text
 
 STUDY_TEXTS = {"start": "Start the study", "continue": "Continue the study", "again": "Make the study again"}
 LEAST_TEXTURES = 2

@@ -1,6 +1,9 @@
-"""Texts and progress on widgets that are refreshed many times a second."""
+"""Widgets that are refreshed many times a second: texts, progress, and changes that nobody is told of."""
 
 from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
 
 
 def set_text(widget, text: str) -> None:
@@ -19,3 +22,14 @@ def set_percent(bar, percent: int) -> None:
         bar.updatesEnabled = False
         bar.value = percent
         bar.updatesEnabled = True
+
+
+@contextlib.contextmanager
+def quiet(*widgets) -> Iterator[None]:
+    """Within the block the widgets tell nobody that they changed."""
+    before = [widget.blockSignals(True) for widget in widgets]
+    try:
+        yield
+    finally:
+        for widget, blocked in zip(widgets, before):
+            widget.blockSignals(blocked)
