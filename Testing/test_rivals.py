@@ -88,6 +88,16 @@ def test_both_parts_of_a_rival_learn_apart():
     assert all(p.grad is None for p in network.segmenter.parameters())
 
 
+def test_a_rivals_pose_is_learnt_in_full_precision_where_the_rest_is_not():
+    torch.manual_seed(0)
+    network = build_network("regression", 64, 0.4, "probability")
+    image, rendered = torch.rand(2, 3, 64, 64), (torch.rand(2, 1, 32, 32) > 0.7).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        logits, pose = network(image, rendered)
+    torch.testing.assert_close(pose, network.regressor(rendered), rtol=0, atol=0)
+    assert not torch.equal(logits, network.segmenter(image))
+
+
 def test_what_the_pose_network_reads():
     torch.manual_seed(0)
     image, seen = torch.rand(1, 3, 64, 64), []

@@ -100,7 +100,8 @@ class SegmentedRegressor(nn.Module):
         """-> (B, 6); given rendered masks (B, 1, S/2, S/2): logits of the vessels, and the pose of those masks."""
         logits = self.segmenter(image)
         if rendered is not None:
-            return logits, self.regressor(rendered)
+            with torch.autocast(image.device.type, enabled=False):  # bf16 has too few digits for a pose
+                return logits, self.regressor(rendered)
         binary = self.reads == "mask"
         return self.regressor((logits * self.RAMP + 0.5).clamp(0, 1) if binary else torch.sigmoid(logits))
 

@@ -196,7 +196,8 @@ class _Trainer:
         saved, interval_s = time.monotonic(), checkpoint_interval_s(0.0)
         if self.device.type == "cpu":
             torch.set_num_threads(_training_threads())
-        use_bfloat16 = preset.estimator == "dense" and fast_dtype(self.device) is torch.bfloat16
+        segments = preset.estimator == "dense" or preset.reads != "image"
+        use_bfloat16 = segments and fast_dtype(self.device) is torch.bfloat16
         recent: list[float] = []
         first = state["drawn"]
         workers = _feeder_workers(self.device)
