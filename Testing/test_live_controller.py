@@ -179,6 +179,28 @@ def test_a_stream_that_returns_is_told_from_a_view_of_its_name_and_from_the_pane
     source.close()
 
 
+def test_a_single_step_takes_what_a_volume_holds_that_does_not_change_any_more(application, phantom, model, frames):
+    scene, _logic = application
+    stream = node_with(scene, frames[1][0])
+    now = [100.0]
+    controller = LiveController(scene, clock=lambda: now[0])
+    controller.start(choice_of(phantom), model=model)
+    wait_for(controller, lambda s: s.new)
+    send(stream, frames[1][1])
+    wait_for(controller, lambda s: s.new)
+    now[0] += 7.0
+    controller.next_frame()
+    now[0] += 0.3  # the next one may still come
+    assert not any(controller.tick(0.01).new for _ in range(20))
+    now[0] += 0.3
+    status = wait_for(controller, lambda s: s.new)
+    assert status.verdict.sight is Sight.FROZEN and status.verdict.age_s == pytest.approx(7.6)
+    np.testing.assert_array_equal(shown_pixels(controller.live), frames[1][1])
+    now[0] += 60
+    assert not any(controller.tick(0.01).new for _ in range(5))
+    controller.close()
+
+
 def test_pictures_that_cannot_be_decoded_are_no_new_frames(application, frames):
     """The node's image is then still the one before, and counts as changed: it would never get too old."""
     scene, _logic = application
@@ -212,9 +234,13 @@ def test_nodes_that_the_user_removed_are_there_again_after_a_start(application, 
     controller = LiveController(scene)
     controller.start(choice_of(phantom, stale_s=60), model=model)
     wait_for(controller, lambda s: s.new)
-    controller.stop()
     live = controller.live
     scene.RemoveNode(live.frame if removed == "frame" else (live.models | live.lines)[removed])
+    send(stream, frames[1][2])
+    status = wait_for(controller, lambda s: s.new)
+    assert status.verdict.sight is Sight.FAILED and "removed" in status.verdict.detail
+    assert not controller.live.overlay_visible
+    controller.stop()
     controller.start(choice_of(phantom, stale_s=60), model=model)
     wait_for(controller, lambda s: s.new)
     send(stream, frames[1][1])

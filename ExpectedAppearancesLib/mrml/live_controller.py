@@ -191,11 +191,13 @@ class LiveController:
 
     @at_once
     def next_frame(self) -> None:
-        """Register one more frame and hold it."""
+        """Register one more frame and hold it; of a volume that does not change any more, what it holds."""
         self.finish_alignment(keep=False)
         self._forget_truth()
         if self._session is not None:
             self._session.next_frame()
+        if self._stream is not None:
+            self._stream.again_after(self._session.stale_s)
 
     def set_stale(self, stale_s: float) -> None:
         if self._session is not None:
@@ -233,9 +235,9 @@ class LiveController:
         if self._stream is not None:
             self._session.say_source(self._stream.look())
         update = self._session.tick(wait_s)
-        if not self.live.vessels_are_the_cases:
-            changed = "The vessels in the scene were changed: edited, or a transform of theirs was hardened"
-            update = replace(update, verdict=Verdict(Sight.FAILED, update.verdict.age_s, changed))
+        damage = self.live.damage
+        if damage:
+            update = replace(update, verdict=Verdict(Sight.FAILED, update.verdict.age_s, damage))
         begin = time.perf_counter()
         self._show(update)
         if update.new is not None:
@@ -381,7 +383,7 @@ class LiveController:
 
     # ----------------------------------------------------------------------------------------------------- internal
     def _is_open(self, folder: Path) -> bool:
-        there = self.case is not None and self.live is not None and self.live.is_whole
+        there = self.case is not None and self.live is not None and not self.live.damage
         return there and self.case.folder == Path(folder).absolute()
 
     def _put_up(self, case: Case, overlays: OverlayMaker) -> None:

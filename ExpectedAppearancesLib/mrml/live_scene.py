@@ -102,16 +102,15 @@ class LiveScene:
             self._stamp = self._newest_change()
 
     @property
-    def is_whole(self) -> bool:
-        """Whether the user removed none of the nodes, and left the vessels as they were."""
+    def damage(self) -> str:
+        """What the user did to the nodes that no frame can be shown with, in words; '' where nothing."""
+        if self._points_of_vessels() != self._vessel_points:  # no camera would follow that
+            return "The vessels in the scene were changed: edited, or a transform of theirs was hardened"
         nodes = (self.transform, self.frame, self.frustum, self.fill, self.backdrop)
         nodes += (*self.models.values(), *self.lines.values())
-        return self.vessels_are_the_cases and all(self._scene.IsNodePresent(n) for n in nodes if n is not None)
-
-    @property
-    def vessels_are_the_cases(self) -> bool:
-        """False once the user hardened a transform of theirs, or edited them: no camera would follow that."""
-        return self._points_of_vessels() == self._vessel_points
+        if not all(self._scene.IsNodePresent(node) for node in nodes if node is not None):
+            return "Something that the live views need was removed from the scene"
+        return ""
 
     def _points_of_vessels(self) -> tuple | None:
         data = self.models[scenes.VESSELS].GetPolyData()

@@ -26,6 +26,7 @@ class NodeFrames:
         self._number = 0
         self._stamp: tuple | None = None
         self._problem = ""
+        self._taken_s, self._again_s = -math.inf, math.inf
         self._attach(node, -math.inf)  # what it holds may be of yesterday
 
     @property
@@ -44,7 +45,14 @@ class NodeFrames:
             node = find_volume(self._scene, self._id) or find_volume(self._scene, self._name)
             if node is not None:
                 self._attach(node, self._clock())
+        elif self._clock() >= self._again_s:
+            self._stamp = None
+            self._take(self._taken_s)
         return self.status
+
+    def again_after(self, wait_s: float) -> None:
+        """Hand on once more what the volume holds, as old as it is, unless it changes before that time is over."""
+        self._again_s = self._clock() + wait_s
 
     def close(self) -> None:
         self._detach()
@@ -83,6 +91,7 @@ class NodeFrames:
         self._stamp = stamp
         image = pixels_of(data)
         self._problem = "" if image is not None else f"The volume {self._name} holds no picture of one slice."
+        self._taken_s, self._again_s = taken_s, math.inf
         if image is not None:
             self._number += 1
             self._deliver(LiveFrame(image, taken_s, self._number - 1, f"{self._name} {self._number - 1}"))
