@@ -217,12 +217,16 @@ def test_photograph_and_labels_survive_the_segment_editors_form(scene):
     nodes = labelling.add_photograph(scene, "cortex", image, labels)
     np.testing.assert_array_equal(labelling.labels_of(nodes), labels)
     segmentation = nodes["segmentation"].GetSegmentation()
-    segmentation.RemoveSegment(segmentation.GetSegmentIdBySegmentName("Outside of the cortex"))
+    outside = segmentation.GetSegmentIdBySegmentName("Outside of the cortex")
+    segmentation.GetSegment(outside).SetName("Dura")  # by the user
+    np.testing.assert_array_equal(labelling.labels_of(nodes), labels)
+    segmentation.RemoveSegment(outside)
     np.testing.assert_array_equal(labelling.labels_of(nodes), np.maximum(labels, 1))
     planning.remove_nodes(scene, nodes)
     assert scene.GetNumberOfNodes() == before
     nodes = labelling.add_photograph(scene, "no vessels", image, np.ones((40, 60), np.uint8))
     assert (labelling.labels_of(nodes) == 1).all()
+    assert nodes["segmentation"].GetSegmentation().GetNumberOfSegments() == 2  # to draw into
 
 
 SHARES = ("Within 3 mm, 3° (%)", "Accepted below 3 mm (%)")

@@ -28,6 +28,7 @@ def add_photograph(scene, name: str, image_rgb: np.ndarray, labels: np.ndarray) 
             node.GetDisplayNode().SetWindowLevelMinMax(0, 255)
     segmentation = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", f"{name} labels")
     segmentation.CreateDefaultDisplayNodes()
+    segmentation.SetSourceRepresentationToBinaryLabelmap()
     segmentation.SetReferenceImageGeometryParameterFromVolumeNode(grey)
     for label, (title, rgb) in SEGMENTS.items():
         _add_segment(segmentation, grey, labels == label, title, rgb)
@@ -43,22 +44,25 @@ def labels_of(nodes: dict) -> np.ndarray:
     segmentation = nodes["segmentation"].GetSegmentation()
     for label in (BACKGROUND, VESSELS):
         title = SEGMENTS[label][0]
-        identifier = segmentation.GetSegmentIdBySegmentName(title)
+        # One that was deleted and made anew has the title and no more.
+        identifier = title if segmentation.GetSegment(title) else segmentation.GetSegmentIdBySegmentName(title)
         if identifier:
             labels[_segment_mask(slicer, nodes, identifier, (height, width))] = label
     return labels
 
 
 def _add_segment(segmentation_node, volume, mask: np.ndarray, title: str, rgb) -> None:
+    """Its id is its first title: the user may give it another one."""
     import slicer
 
     image = slicer.vtkOrientedImageData()
     image.ShallowCopy(image_data(mask.astype(np.uint8)))
     image.SetImageToWorldMatrix(_matrix_of(volume))
-    if not mask.any():
-        segmentation_node.GetSegmentation().AddEmptySegment(title, title, list(rgb))
-        return
-    segmentation_node.AddSegmentFromBinaryLabelmapRepresentation(image, title, list(rgb))
+    segment = slicer.vtkSegment()
+    segment.SetName(title)
+    segment.SetColor(*rgb)
+    segment.AddRepresentation(slicer.vtkSegmentationConverter.GetSegmentationBinaryLabelmapRepresentationName(), image)
+    segmentation_node.GetSegmentation().AddSegment(segment, title)
 
 
 def _segment_mask(slicer, nodes: dict, identifier: str, shape: tuple[int, int]) -> np.ndarray:
