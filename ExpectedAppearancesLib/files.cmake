@@ -58,6 +58,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/evaluation/study_figures.py
   ExpectedAppearancesLib/evaluation/study_folds.py
   ExpectedAppearancesLib/evaluation/study_frames.py
+  ExpectedAppearancesLib/evaluation/study_inputs.py
   ExpectedAppearancesLib/evaluation/study_report.py
   ExpectedAppearancesLib/evaluation/verdict.py
   ExpectedAppearancesLib/executor.py

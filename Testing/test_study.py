@@ -23,7 +23,7 @@ from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, ExpectedAppearancesError, InputError
-from ExpectedAppearancesLib.evaluation import study, study_folds
+from ExpectedAppearancesLib.evaluation import study, study_folds, study_inputs
 from ExpectedAppearancesLib.evaluation.study_report import write_study_report
 from ExpectedAppearancesLib.evaluation.verdict import figures_of_study
 from ExpectedAppearancesLib.geometry.camera import write_camera
@@ -208,7 +208,7 @@ def test_folds_of_an_older_version_are_trained_anew(studied, no_pictures, monkey
     monkeypatch.setattr(study, "MODEL_VERSION", study.MODEL_VERSION - 1)
     run(studied, replace(QUICK, styles=("a",)))
     monkeypatch.undo()
-    jobs = study._jobs(study._open(studied.case, studied.poses, QUICK), QUICK)
+    jobs = study._jobs(study_inputs.open_studied(studied.case, studied.poses, QUICK), QUICK)
     assert not any(map(study_folds.is_trained, jobs))
 
 
@@ -295,7 +295,7 @@ def alive(process_id: int) -> bool:
 
 
 def some_job(studied) -> study_folds.FoldJob:
-    one = study._open(studied.case, studied.poses, QUICK)
+    one = study_inputs.open_studied(studied.case, studied.poses, QUICK)
     return study._jobs(one, QUICK)[0]
 
 
@@ -360,16 +360,16 @@ def test_poses_that_training_sees_are_not_called_unseen(studied, monkeypatch):
         files.write_png(store.folder_of(case, "image") / f"{style}.png", np.full((8, 8, 3), 90, np.uint8))
     write_index = functools.partial(store.write_index, case, "image", camera(), {}, done=True)
     write_index(index["items"])
-    monkeypatch.setattr(study, "drawn_frames", lambda *_: studied.poses)
+    monkeypatch.setattr(study_inputs, "drawn_frames", lambda *_: studied.poses)
     unasked = [(studied.case, None)]
     for settings in (QUICK, replace(QUICK, protocols=(), textures_study=True)):
         with pytest.raises(InputError, match="loto alone"):
             study.run_study(unasked, studied.out, replace(settings, method="image"))
     assert not calls(studied)
-    study._check(unasked, studied.out, replace(QUICK, protocols=("loto",), method="image"), lambda *_: None)
+    study_inputs.check_study(unasked, studied.out, replace(QUICK, protocols=("loto",), method="image"), lambda *_: None)
     poses = [pose_from_rotation(np.eye(3), (i, 0, 80)).tolist() for i in range(3)]
     write_index([item | {"camera_from_world": pose} for item, pose in zip(index["items"], poses)])
-    study._check(unasked, studied.out, replace(QUICK, method="image"), lambda *_: None)
+    study_inputs.check_study(unasked, studied.out, replace(QUICK, method="image"), lambda *_: None)
     # And poses that no training sees are not called seen: no other texture's appearance is at a frame's pose.
     with pytest.raises(InputError, match="strict alone"):
         study.run_study(unasked, studied.out, replace(QUICK, protocols=("loto",), method="image"))
@@ -413,7 +413,7 @@ def test_frames_that_cannot_be_registered_are_told_before_anything_is_trained(st
     assert [name in text for name, text in zip(("2.png", "7.png"), caught.value.problems)] == [True, True]
     assert not calls(studied)
     pairs, of_another = [(studied.case, studied.poses)], replace(QUICK, styles=("a",))
-    assert study._check(pairs, studied.out, of_another, lambda *_: None)  # it registers neither
+    assert study_inputs.check_study(pairs, studied.out, of_another, lambda *_: None)  # it registers neither
 
 
 def test_a_model_that_cannot_be_tested_for_robustness_is_told_before_anything_is_trained(studied, monkeypatch):

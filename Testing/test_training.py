@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -300,7 +301,28 @@ def test_paper_network_is_the_papers():
     assert kinds == [*block, "AvgPool2d", *block, "AvgPool2d", *block]
     assert [layer.out_features for layer in network.head if hasattr(layer, "out_features")] == [128, 64, 32, 6]
     preset = PRESETS["paper"]
-    assert (preset.batch, preset.learning_rate, preset.final_learning_rate) == (8, 1e-3, 1e-4)
+    assert preset.batch == 8 and preset.learning_rate / preset.final_learning_rate == pytest.approx(10)
+
+
+def test_paper_network_learns_from_views_that_differ():
+    """It had PyTorch's usual initial weights: all that it did in thousands of steps was to lose its ReLUs."""
+    torch.manual_seed(0)
+    side, preset = 32, PRESETS["paper"]
+    network = build_network("regression", side, 1.0)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=preset.learning_rate)
+    encoding, rows, losses = SimpleNamespace(translation_scale_mm=20.0), torch.arange(side), []
+    for _ in range(200):
+        images = 0.3 * torch.rand(8, 3, side, side) + 0.5 * torch.rand(8, 3, 1, 1)
+        place = 0.6 * torch.rand(8, 2) + 0.2
+        away = rows[None] - side * place[..., None]
+        blob = torch.exp(-(away[:, 0, :, None].square() + away[:, 1, None].square()) / 8)[:, None]
+        target = torch.cat([torch.zeros(8, 3), 4 * (place - 0.5), torch.randn(8, 1)], dim=1)
+        loss = regression_loss(network(images * (1 - blob) + 0.1 * blob), target, encoding)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert np.mean(losses[-30:]) < 0.75 * np.mean(losses[:30])
 
 
 @pytest.fixture(scope="module")
@@ -385,6 +407,7 @@ def test_saving_costs_a_hundredth_of_the_time_and_a_kill_loses_a_bounded_time():
 STEPPER = """
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.model import presets, training
 

@@ -29,6 +29,10 @@ class PaperRegressor(nn.Module):
             nn.ReLU(),
             nn.Linear(32, 6),
         )
+        for module in self.modules():
+            if isinstance(module, (nn.Conv2d, nn.Linear)):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """-> (B, 6): rotation vector relative to the case's reference (rad), scaled translation."""

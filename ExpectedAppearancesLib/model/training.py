@@ -312,10 +312,10 @@ class _Trainer:
         return regression_loss(output, torch.from_numpy(target).float().to(self.device), self.encoding)
 
     def _learning_rate(self, done: float) -> float:
-        """The paper's exponential decay for its network; for the dense one a short warm-up, then cosine decay."""
+        """A short warm-up, then the paper's exponential decay for its network, cosine decay for the dense one."""
         first, last = self.preset.learning_rate, self.preset.final_learning_rate
         if self.preset.estimator == "regression":
-            return first * (last / first) ** done
+            return min(1.0, (1 + self.state["step"]) / 200) * first * (last / first) ** done
         warm_up = min(1.0, 0.02 + self.state["step"] / 60)
         return warm_up * (last + (first - last) * 0.5 * (1 + math.cos(math.pi * done)))
 
