@@ -71,6 +71,10 @@ class SurfacePainter:
         image = self._lit(image, labels, where_px, camera_from_world, rng)
         return _focused(image, labels, depth_mm, rng) if rng.uniform() < DEPTH_OF_FIELD else image
 
+    def as_synthesised(self, where_px: np.ndarray, rng) -> np.ndarray:
+        """uint8 RGB (H, W, 3) of one texture's overview at those places, (H, W, 2) px, and nothing else."""
+        return _look_up(self._overviews[rng.integers(len(self._overviews))].image, where_px)
+
     def cortex(self, rng) -> np.ndarray:
         """Parenchyma of a random texture, uint8 RGB: cortex that is nowhere on the case's surface."""
         return self._plate(self._overviews[rng.integers(len(self._overviews))])

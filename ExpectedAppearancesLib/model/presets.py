@@ -11,7 +11,8 @@ class Preset:
 
     size_px: side of the square network input. fresh: new views in each batch; the others are drawn from the last
     `remembered` views, since rendering on a CPU costs as much as training does. minutes: the schedule ends at `steps`
-    or at this time, whichever is first. fresh_poses: every new view has a pose of its own. negatives: share of views
+    or at this time, whichever is first. fresh_poses: every new view has a pose of its own. varied: whether views differ
+    in more than pose, texture and elastic deformation, which is all that the paper's do. negatives: share of views
     that show something else, for which no surface may be found. reads: what the regression sees: 'image', or vessels as
     a U-Net segments them, their 'probability' or the thresholded 'mask' (ProbSEG and BinSEG, Haouchine et al. 2022).
     """
@@ -27,6 +28,7 @@ class Preset:
     final_learning_rate: float
     width: float = 1.0
     fresh_poses: bool = True
+    varied: bool = True
     negatives: float = 0.06
     elastic_px: float = 2.0
     validation_views: int = 192
@@ -41,8 +43,7 @@ class Preset:
 PRESETS = {
     "quick": Preset("quick", "dense", 128, 3000, 24, 8, 26.0, 2e-3, 2e-5),
     "best": Preset("best", "dense", 192, 6000, 24, 8, 90.0, 2e-3, 2e-5, validate_every=250),
-    # 200 epochs of about 1,500 images, batch 8 (the paper's section 2.3); training sets the steps from the images. The
-    # paper's learning rate, 1e-3 to 1e-4, ends all of its network's ReLUs within 500 steps of views this varied.
+    # 200 epochs of about 1,500 images, batch 8 (the paper's section 2.3); training sets the steps from the images.
     "paper": Preset(
         "paper",
         "regression",
@@ -51,9 +52,10 @@ PRESETS = {
         8,
         8,
         720.0,
-        3e-4,
-        3e-5,
+        1e-3,
+        1e-4,
         fresh_poses=False,
+        varied=False,
         negatives=0.0,
         validate_every=500,
     ),

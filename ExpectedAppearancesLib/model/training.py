@@ -80,7 +80,14 @@ def train_case(
         steps = math.ceil(PAPER_EPOCHS * sum(a.style in trained_on for a in appearances) / preset.batch)
         preset = replace(preset, steps=min(preset.steps, steps))
     views = ViewSettings(
-        method, preset.size_px, tuple(trained_on), preset.fresh_poses, preset.negatives, preset.elastic_px, seed + 1
+        method,
+        preset.size_px,
+        tuple(trained_on),
+        preset.fresh_poses,
+        preset.negatives,
+        preset.elastic_px,
+        seed + 1,
+        varied=preset.varied,
     )
     if fold and fold.poses_path:
         views = replace(views, poses_file=str(Path(fold.poses_path).absolute()))

@@ -48,7 +48,8 @@ class ViewSettings:
     """How views are drawn. styles: textures used. negatives: share of views of something else.
 
     poses_file: views are seen from this file's poses only (the paper's protocol repeats its poses); None: from fresh
-    ones.
+    ones. varied: False for the paper's views: appearances as they were synthesised, elastically deformed, and nothing
+    else.
     """
 
     method: str
@@ -59,6 +60,7 @@ class ViewSettings:
     elastic_px: float
     seed: int
     poses_file: str | None = None
+    varied: bool = True
 
 
 class ViewSource:
@@ -104,12 +106,17 @@ class ViewSource:
 
     def view(self, index: int) -> View:
         rng = np.random.default_rng([self.settings.seed, 7, index])
+        varied = self.settings.varied
         if self._painter:
             seen = self._poses
             pose = self._fresh_pose(index) if seen is None else seen[rng.integers(len(seen))]
             labels, depth_mm, points = self._renderer.render_surface(pose)
-            image = self._painter.paint(labels, depth_mm, self._painter.overview_px(points), pose, rng)
-            cortex = self._painter.cortex(rng)
+            where_px = self._painter.overview_px(points)
+            if varied:
+                image = self._painter.paint(labels, depth_mm, where_px, pose, rng)
+                cortex = self._painter.cortex(rng)
+            else:
+                image = self._painter.as_synthesised(where_px, rng)
         else:
             appearance = self._appearances[rng.integers(len(self._appearances))]
             fresh = self.settings.fresh_poses and self._poses is None
@@ -118,6 +125,15 @@ class ViewSource:
             labels, _, points = self._renderer.render_surface(pose)
             image = self._turned(appearance, turn)
             cortex = appearance.image
+        if varied:
+            image = self._in_a_field(image, labels, points, cortex, rng)
+        else:
+            self._clear_bars(labels, 1)
+            image = cv2.copyTo(image, labels)
+        return self._finish(image, pose, labels, points, rng)
+
+    def _in_a_field(self, image, labels, points, cortex, rng) -> np.ndarray:
+        """The view with what lies around the surface; what the craniotomy hides of it is taken out of `labels`."""
         hidden = opening(cv2.transform(points, self._frontal), self._middle_mm, self._extent_mm, rng)
         if hidden is not None:
             labels *= hidden
@@ -125,8 +141,7 @@ class ViewSource:
         tissue = labels != BACKGROUND
         if hidden is None:
             image, tissue = continue_tissue(image, tissue.astype(np.uint8), rng)
-        image = fill_outside(image, ~tissue, cortex, rng)
-        return self._finish(image, pose, labels, points, rng)
+        return fill_outside(image, ~tissue, cortex, rng)
 
     def close(self) -> None:
         self._renderer.close()
@@ -173,7 +188,8 @@ class ViewSource:
             # The brain moves and takes its points along: what a pixel shows stays true.
             moved = cv2.resize(coarse, cells_px.shape[1::-1], interpolation=cv2.INTER_LINEAR)
             cells_px = cells_px + moved * np.float32(len(labels) / 64)
-        small = microscope.apply(small, rng)
+        if self.settings.varied:
+            small = microscope.apply(small, rng)
         points, surface, vessels = _to_grid(points, labels, cells_px)
         if self.settings.elastic_px > 0:
             pose = elastic.nearest_pose(pose, points, surface, self.camera)
