@@ -29,6 +29,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/case/meshes.py
   ExpectedAppearancesLib/cli/__init__.py
   ExpectedAppearancesLib/cli/check.py
+  ExpectedAppearancesLib/cli/command_line_module.py
   ExpectedAppearancesLib/cli/demo.py
   ExpectedAppearancesLib/cli/evaluate.py
   ExpectedAppearancesLib/cli/logs.py
@@ -65,10 +66,12 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/files.py
   ExpectedAppearancesLib/geometry/__init__.py
   ExpectedAppearancesLib/geometry/camera.py
+  ExpectedAppearancesLib/geometry/displacement.py
   ExpectedAppearancesLib/geometry/pose.py
   ExpectedAppearancesLib/geometry/se3.py
   ExpectedAppearancesLib/geometry/silhouette.py
   ExpectedAppearancesLib/gpus.py
+  ExpectedAppearancesLib/interpreter.py
   ExpectedAppearancesLib/live/__init__.py
   ExpectedAppearancesLib/live/alignment.py
   ExpectedAppearancesLib/live/choice.py
@@ -142,7 +145,6 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/registration/tracking.py
   ExpectedAppearancesLib/runs/__init__.py
   ExpectedAppearancesLib/runs/closing.py
-  ExpectedAppearancesLib/runs/command_line_module.py
   ExpectedAppearancesLib/runs/dependencies.py
   ExpectedAppearancesLib/runs/environment.py
   ExpectedAppearancesLib/runs/output.py
@@ -152,6 +154,7 @@ set(EXPECTEDAPPEARANCESLIB_SCRIPTS
   ExpectedAppearancesLib/runs/results.py
   ExpectedAppearancesLib/runs/runner.py
   ExpectedAppearancesLib/runs/state.py
+  ExpectedAppearancesLib/runs/system_findings.py
   ExpectedAppearancesLib/runs/system_report.py
   ExpectedAppearancesLib/runs/worker.py
   ExpectedAppearancesLib/textures/__init__.py

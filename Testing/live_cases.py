@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from ExpectedAppearancesLib.demo.phantom import CAMERA
-from ExpectedAppearancesLib.evaluation.metrics import add_mm
+from ExpectedAppearancesLib.geometry.displacement import add_mm
 from ExpectedAppearancesLib.live.choice import Choice, SourceKind
 
 SMALL = CAMERA.resized(320, 240)

@@ -15,8 +15,8 @@ import pytest
 from ExpectedAppearancesLib.cancelling import cancelling_waits
 from ExpectedAppearancesLib.cli import main, termination_cancels
 from ExpectedAppearancesLib.errors import CancelledError, InputError
+from ExpectedAppearancesLib.interpreter import library_environment
 from ExpectedAppearancesLib.runs import record
-from ExpectedAppearancesLib.runs.environment import library_environment
 from ExpectedAppearancesLib.runs.record import (
     LOOK_EVERY_S,
     RunRecord,

@@ -22,12 +22,12 @@ import pytest
 from ExpectedAppearancesLib import cli
 from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.case.meshes import Mesh, write_vtp
-from ExpectedAppearancesLib.cli import check
 from ExpectedAppearancesLib.cli import logs as cli_logs
 from ExpectedAppearancesLib.cli.logs import log_file
 from ExpectedAppearancesLib.cli.progress import Progress, duration
 from ExpectedAppearancesLib.errors import CancelledError, ExpectedAppearancesError, InputError
 from ExpectedAppearancesLib.geometry.camera import Camera, write_camera
+from ExpectedAppearancesLib.runs import system_findings
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("torch", "vtk", "vtkmodules", "cv2", "onnxruntime", "onnx", "scipy", "skimage", "matplotlib", "numpy")
@@ -330,14 +330,14 @@ def test_new_leaves_an_existing_case_as_it_was(tmp_path, inputs):
 
 
 def test_check_reports_this_machine(monkeypatch, capsys):
-    monkeypatch.setattr(check, "_devices", lambda: [{"name": "Some GPU", "memory_gb": 16.0}])
+    monkeypatch.setattr(system_findings, "_devices", lambda: [{"name": "Some GPU", "memory_gb": 16.0}])
     code = cli.main(["check", "--json"])
     report = json.loads(capsys.readouterr().out)
     assert code == (1 if report["problems"] else 0)
     assert report["packages"]["numpy"] == np.__version__
     assert report["weights_mb"]["vgg16_imagenet_to_conv5_1_fp16.safetensors"] > 10
     assert report["disk_free_gb"] > 0 and report["cpu"]["cores"] >= 1
-    monkeypatch.setattr(check, "make_report", lambda: report)
+    monkeypatch.setattr(system_findings, "make_report", lambda: report)
     cli.main(["check"])
     text = capsys.readouterr().out
     assert "GPU: Some GPU, 16.0 GB" in text and f"Package numpy: {np.__version__}" in text
@@ -346,12 +346,12 @@ def test_check_reports_this_machine(monkeypatch, capsys):
 def test_check_survives_broken_graphics_and_missing_packages(monkeypatch, capsys):
     def version(name):
         if name in ("onnxruntime", "onnxruntime-gpu", "onnxruntime-directml", "torch", "slicer-core"):
-            raise check.metadata.PackageNotFoundError(name)
+            raise system_findings.metadata.PackageNotFoundError(name)
         return "1.0"
 
-    monkeypatch.setattr(check.metadata, "version", version)
-    monkeypatch.setattr(check, "RENDER_SPHERE", "import os; os.abort()")
-    monkeypatch.setattr(check, "WEIGHTS_FOLDER", Path("none"))
+    monkeypatch.setattr(system_findings.metadata, "version", version)
+    monkeypatch.setattr(system_findings, "RENDER_SPHERE", "import os; os.abort()")
+    monkeypatch.setattr(system_findings, "WEIGHTS_FOLDER", Path("none"))
     assert cli.main(["check"]) == 1
     text = capsys.readouterr().out
     assert "Package torch: not installed" in text and "Package slicer-core: not installed" in text

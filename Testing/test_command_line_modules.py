@@ -19,10 +19,10 @@ from cases import write_inputs
 from ExpectedAppearancesLib import __version__, files
 from ExpectedAppearancesLib.appearances import store
 from ExpectedAppearancesLib.case.case import Case
+from ExpectedAppearancesLib.cli import command_line_module
+from ExpectedAppearancesLib.cli.command_line_module import SlicerProgress, command_arguments, parser_of
 from ExpectedAppearancesLib.masks.stage import render_case
 from ExpectedAppearancesLib.model import presets
-from ExpectedAppearancesLib.runs import command_line_module
-from ExpectedAppearancesLib.runs.command_line_module import SlicerProgress, command_arguments, parser_of
 from ExpectedAppearancesLib.runs.environment import MODULES, script_of
 from ExpectedAppearancesLib.runs.record import exclusive
 from ExpectedAppearancesLib.runs.results import result_problem
@@ -316,10 +316,10 @@ def test_scripts_find_the_library_of_an_installed_extension(tmp_path):
     """lib/Slicer-5.8/{cli-modules,qt-scripted-modules}: as Slicer's macros install them."""
     root = tmp_path / "Erweiterung ü" / "lib" / "Slicer-5.8"
     (root / "cli-modules").mkdir(parents=True)
-    (root / "qt-scripted-modules" / "ExpectedAppearancesLib" / "runs").mkdir(parents=True)
-    for name in ("ExpectedAppearancesLib", "ExpectedAppearancesLib/runs"):
+    (root / "qt-scripted-modules" / "ExpectedAppearancesLib" / "cli").mkdir(parents=True)
+    for name in ("ExpectedAppearancesLib", "ExpectedAppearancesLib/cli"):
         (root / "qt-scripted-modules" / name / "__init__.py").touch()
-    (root / "qt-scripted-modules" / "ExpectedAppearancesLib" / "runs" / "command_line_module.py").write_text(
+    (root / "qt-scripted-modules" / "ExpectedAppearancesLib" / "cli" / "command_line_module.py").write_text(
         "def main(command):\n    print(command, __file__)\n    return 0\n", encoding="utf-8"
     )
     for command in MODULES:
@@ -337,7 +337,7 @@ def test_scripts_find_the_library_of_an_installed_extension(tmp_path):
         assert done.returncode == 0, done.stderr
         assert done.stdout.split(" ", 1) == [
             command,
-            str(root / "qt-scripted-modules" / "ExpectedAppearancesLib" / "runs" / "command_line_module.py") + "\n",
+            str(root / "qt-scripted-modules" / "ExpectedAppearancesLib" / "cli" / "command_line_module.py") + "\n",
         ]
 
 
@@ -346,7 +346,7 @@ def test_scripts_find_the_library_of_an_installed_extension(tmp_path):
 def test_a_run_gives_way_to_the_slicer_that_started_it(gained, policy):
     code = (
         f"import os; before = os.nice({gained})\n"
-        "from ExpectedAppearancesLib.runs.command_line_module import give_way; give_way()\n"
+        "from ExpectedAppearancesLib.cli.command_line_module import give_way; give_way()\n"
         f"assert os.sched_getscheduler(0) == os.{policy}\n"
         "assert os.nice(0) == max(before, 10), (before, os.nice(0))"
     )

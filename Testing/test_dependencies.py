@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from ExpectedAppearancesLib.cli import check
 from ExpectedAppearancesLib.errors import InputError
-from ExpectedAppearancesLib.runs import dependencies
+from ExpectedAppearancesLib.runs import dependencies, system_findings
 from ExpectedAppearancesLib.runs.dependencies import InstallError, Package
 from ExpectedAppearancesLib.runs.pip_words import explanation
 from ExpectedAppearancesLib.runs.system_report import SystemCheck, system_report
@@ -254,14 +253,14 @@ def test_torch_comes_through_its_extension_except_from_a_folder(slicer, monkeypa
 
 def test_check_knows_every_package_that_serves_as_well():
     """It told to install a second OpenCV beside the one that other extensions bring, which spoils both."""
-    known = {name for names, _needed_by in check.PACKAGES for name in names}
+    known = {name for names, _needed_by in system_findings.PACKAGES for name in names}
     for package in dependencies.REQUIREMENTS["registration"]:
         assert {package.name, *package.others} <= known, package
 
 
 def test_report_for_a_mail_holds_what_check_says_and_slicers_version(slicer, monkeypatch):
-    monkeypatch.setattr(check, "_run_python", lambda _source: (0, "[]", ""))
-    report = system_report(check.make_report())
+    monkeypatch.setattr(system_findings, "_run_python", lambda _source: (0, "[]", ""))
+    report = system_report(system_findings.make_report())
     monkeypatch.undo()
     assert report.startswith("3D Slicer 5.8.1 (revision 33241, linux-amd64)")
     assert f"Package numpy: {metadata.version('numpy')}" in report

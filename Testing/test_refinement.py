@@ -11,7 +11,7 @@ from cases import dome, vessels
 
 from ExpectedAppearancesLib.case.meshes import Mesh
 from ExpectedAppearancesLib.demo.vessel_tree import demo_camera, generate_case_meshes
-from ExpectedAppearancesLib.evaluation.metrics import add_mm
+from ExpectedAppearancesLib.geometry.displacement import add_mm
 from ExpectedAppearancesLib.geometry.pose import pose_from_rotation, rotation_matrix
 from ExpectedAppearancesLib.geometry.silhouette import Silhouette
 from ExpectedAppearancesLib.masks.exposed import exposed_vessels

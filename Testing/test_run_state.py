@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ExpectedAppearancesLib.runs.environment import LIBRARY_PARENT, environment_of, python_for_runs, script_of
+from ExpectedAppearancesLib.interpreter import LIBRARY_PARENT, python_for_runs
+from ExpectedAppearancesLib.runs.environment import environment_of, script_of
 from ExpectedAppearancesLib.runs.output import READ_AT_ONCE, OutputReader
 from ExpectedAppearancesLib.runs.state import RunState, controls
 
@@ -123,7 +124,7 @@ def test_the_library_is_found_whatever_the_path_was(monkeypatch):
 
 
 def test_a_run_solves_small_systems_on_one_thread_unless_the_user_says_otherwise(monkeypatch):
-    from ExpectedAppearancesLib.runs.environment import library_environment
+    from ExpectedAppearancesLib.interpreter import library_environment
 
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     assert library_environment()["OPENBLAS_NUM_THREADS"] == "1"

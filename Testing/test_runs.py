@@ -16,8 +16,9 @@ import psutil
 import pytest
 
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.interpreter import LIBRARY_PARENT
 from ExpectedAppearancesLib.runs import closing, processes, record, runner
-from ExpectedAppearancesLib.runs.environment import LIBRARY_PARENT, environment_of
+from ExpectedAppearancesLib.runs.environment import environment_of
 from ExpectedAppearancesLib.runs.runner import Run
 from ExpectedAppearancesLib.runs.state import RunState, controls
 

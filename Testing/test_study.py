@@ -28,9 +28,9 @@ from ExpectedAppearancesLib.evaluation.study_report import write_study_report
 from ExpectedAppearancesLib.evaluation.verdict import figures_of_study
 from ExpectedAppearancesLib.geometry.camera import write_camera
 from ExpectedAppearancesLib.geometry.pose import look_at, pose_from_rotation
+from ExpectedAppearancesLib.interpreter import library_environment
 from ExpectedAppearancesLib.registration.poses_file import read_poses, write_poses
 from ExpectedAppearancesLib.registration.predictor import Prediction, Predictor
-from ExpectedAppearancesLib.runs.environment import library_environment
 
 SHIFT_MM = {"a": 1.0, "b": 2.0, "c": 4.0}
 QUICK = study.StudySettings(protocols=("strict",), steps=5)

@@ -39,7 +39,7 @@ import sys
 import numpy as np
 from ExpectedAppearancesLib.evaluation import study_folds
 from ExpectedAppearancesLib.registration import predictor
-from ExpectedAppearancesLib.runs import command_line_module
+from ExpectedAppearancesLib.cli import command_line_module
 
 class Answering:
     def __init__(self, folder):

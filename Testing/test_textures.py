@@ -14,8 +14,8 @@ import pytest
 
 from ExpectedAppearancesLib import files
 from ExpectedAppearancesLib.errors import InputError
+from ExpectedAppearancesLib.interpreter import library_environment
 from ExpectedAppearancesLib.masks.labels import VESSELS
-from ExpectedAppearancesLib.runs.environment import library_environment
 from ExpectedAppearancesLib.textures import generate, thumbnails
 from ExpectedAppearancesLib.textures.library import (
     Texture,

@@ -25,6 +25,7 @@ from ExpectedAppearancesLib.case.case import Case
 from ExpectedAppearancesLib.cli import main
 from ExpectedAppearancesLib.errors import CancelledError, InputError
 from ExpectedAppearancesLib.geometry.pose import transform
+from ExpectedAppearancesLib.interpreter import library_environment
 from ExpectedAppearancesLib.masks.labels import VESSELS
 from ExpectedAppearancesLib.masks.renderer import MaskRenderer
 from ExpectedAppearancesLib.masks.stage import (
@@ -47,7 +48,6 @@ from ExpectedAppearancesLib.registration.decoding import cell_pixels
 from ExpectedAppearancesLib.registration.encoding import fit_encoding, network_camera
 from ExpectedAppearancesLib.registration.poses_file import write_poses
 from ExpectedAppearancesLib.registration.predictor import Predictor
-from ExpectedAppearancesLib.runs.environment import library_environment
 
 CPU = torch.device("cpu")
 COLOURS = np.array([[0, 0, 0], [225, 170, 160], [60, 30, 200]], np.uint8)

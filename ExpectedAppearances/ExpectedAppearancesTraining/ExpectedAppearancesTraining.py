@@ -13,6 +13,6 @@ for _folder in Path(__file__).resolve().parents[:3]:
 
 # Guarded: the process that renders training views imports this file again.
 if __name__ == "__main__":
-    from ExpectedAppearancesLib.runs.command_line_module import main
+    from ExpectedAppearancesLib.cli.command_line_module import main
 
     sys.exit(main("train"))

@@ -13,10 +13,11 @@ from .. import files
 from ..case.case import Case
 from ..errors import InputError, Problems
 from ..geometry.camera import Camera, undistorted
+from ..geometry.displacement import add_mm
 from ..registration.footage import FRAME_MARK, is_there, read_frame_rgb
 from ..registration.poses_file import Frame, check_vessels, read_poses, write_poses
 from ..registration.record import frame_record
-from .metrics import FrameErrors, add_mm, frame_errors, mean_pose, metrics, reliability
+from .metrics import FrameErrors, frame_errors, mean_pose, metrics, reliability
 
 ProgressFunction = Callable[[float, str], None]
 NEEDED_MB = 50.0

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.displacement import add_mm, mean_displacements_mm
 from ..geometry.pose import geodesic_angle_rad, mean_rotation, pose_from_rotation
 from ..registration.confidence import BINS, GOOD_ADD_MM, bin_of, calibration_error
 
@@ -45,11 +46,6 @@ class FrameErrors:
         return FrameErrors(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
-def add_mm(vertices_mm: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """ADD (N,) of the vertices (V, 3) under poses (N, 4, 4), mm."""
-    return _mean_displacements_mm(vertices_mm, true, predicted)[0]
-
-
 def frame_errors(
     vertices_mm: np.ndarray,
     true: Sequence[np.ndarray],
@@ -66,7 +62,7 @@ def frame_errors(
     has_pose = np.array([pose is not None for pose in predicted], bool)
     true_poses = np.array(true, float).reshape(-1, 4, 4)[has_pose]
     predicted_poses = np.array([pose for pose in predicted if pose is not None], float).reshape(-1, 4, 4)
-    add, lateral, depth = _mean_displacements_mm(vertices_mm, true_poses, predicted_poses)
+    add, lateral, depth = mean_displacements_mm(vertices_mm, true_poses, predicted_poses)
     difference = true_poses - predicted_poses
     moved_centroid = difference[:, :3, :3] @ vertices_mm.mean(axis=0) + difference[:, :3, 3]
     rotation_deg = np.degrees(geodesic_angle_rad(true_poses[:, :3, :3], predicted_poses[:, :3, :3]))
@@ -75,17 +71,6 @@ def frame_errors(
         values.append(np.full(len(has_pose), np.nan))
         values[-1][has_pose] = known
     return FrameErrors(*values, has_pose & (True if accepted is None else np.array(accepted, bool)))
-
-
-def _mean_displacements_mm(vertices_mm: np.ndarray, true: np.ndarray, predicted: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Mean over the vertices of the displacement's length, its lateral and its depth part; each (N,)."""
-    vertices_mm = np.asarray(vertices_mm, float)
-    means = np.empty((3, len(true)))
-    for i, difference in enumerate(np.asarray(true, float) - np.asarray(predicted, float)):
-        x, y, z = difference[:3, :3] @ vertices_mm.T + difference[:3, 3:]
-        lateral_2 = x * x + y * y
-        means[:, i] = np.sqrt(lateral_2 + z * z).mean(), np.sqrt(lateral_2).mean(), np.abs(z).mean()
-    return tuple(means)
 
 
 def accuracy(errors: FrameErrors, limit: float) -> float | None:

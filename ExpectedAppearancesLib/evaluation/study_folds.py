@@ -14,7 +14,7 @@ from pathlib import Path
 
 from .. import files
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, CancelledError, ExpectedAppearancesError, InputError
-from ..runs.environment import library_environment, python_for_runs
+from ..interpreter import library_environment, python_for_runs
 
 PROTOCOLS = ("strict", "loto")
 COMMAND = (python_for_runs(), "-m", "ExpectedAppearancesLib")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
-from ..evaluation.metrics import add_mm
 from ..geometry.camera import Camera
+from ..geometry.displacement import add_mm
 from ..geometry.pose import (
     geodesic_angle_rad,
     inverse,

@@ -22,7 +22,7 @@ from ..cancelling import cancelling_waits
 from ..case.case import Case, pose_settings
 from ..case.meshes import write_vtp
 from ..devices import fast_dtype
-from ..evaluation.metrics import add_mm
+from ..geometry.displacement import add_mm
 from ..masks.exposed import exposed_vessels
 from ..masks.stage import craniotomy_of, parenchyma_of, sampler_of
 from ..registration.confidence import calibrate, calibration_error

@@ -18,7 +18,7 @@ from importlib import metadata
 from pathlib import Path
 
 from ..errors import ExpectedAppearancesError, InputError
-from .environment import python_for_runs
+from ..interpreter import python_for_runs
 from .pip_words import explanation
 
 REQUESTER = "Expected Appearances"

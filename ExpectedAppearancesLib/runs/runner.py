@@ -13,8 +13,9 @@ from pathlib import Path
 
 from .. import files
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
+from ..interpreter import python_for_runs
 from . import processes
-from .environment import command_of, environment_of, python_for_runs
+from .environment import command_of, environment_of
 from .output import OutputReader
 from .record import RunRecord, by_the_clock, exclusive, read_record, update_record, write_record
 from .results import remove_partial_files, result_problem

@@ -7,9 +7,10 @@ import subprocess
 import sys
 import tempfile
 
-from ..cli import check
+from ..interpreter import python_for_runs
 from . import dependencies
-from .environment import WITHOUT_WINDOW, environment_of, python_for_runs
+from .environment import WITHOUT_WINDOW, environment_of
+from .system_findings import report_lines
 
 PURPOSES = {"registration": "registering frames", "planning": "planning", "training": "synthesis and training"}
 
@@ -46,7 +47,7 @@ def system_report(report: dict) -> str:
 
     report: what SystemCheck.poll() has found.
     """
-    lines = check.report_lines(report)
+    lines = report_lines(report)
     for kind, purpose in PURPOSES.items():
         lacking = dependencies.missing(kind)
         lines.append(f"For {purpose}: {'lacks ' + ', '.join(lacking) if lacking else 'all packages are there'}")

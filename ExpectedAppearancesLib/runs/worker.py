@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError
-from .environment import WITHOUT_WINDOW, environment_of, python_for_runs
+from ..interpreter import python_for_runs
+from .environment import WITHOUT_WINDOW, environment_of
 
 # Module and function whose result answers the questions of a task, a function of one dict; loaded in the process alone.
 TASKS = {

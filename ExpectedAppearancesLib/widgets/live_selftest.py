@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import slicer
 
-from ..evaluation.metrics import add_mm
+from ..geometry.displacement import add_mm
 from ..live.alignment import nudged
 from ..live.trust import Sight
 from ..mrml import live_views

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import qt
 
+from ..interpreter import python_for_runs
 from ..planning.steps import Step, StepState
-from ..runs.environment import WITHOUT_WINDOW, environment_of, python_for_runs
+from ..runs.environment import WITHOUT_WINDOW, environment_of
 from ..runs.worker import Worker
 from .drawing import DrawnInTurn
 from .refreshing import set_text

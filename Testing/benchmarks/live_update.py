@@ -234,7 +234,7 @@ def _nodes(scene) -> list:
 
 
 def _check(phantom, true: np.ndarray, predicted: np.ndarray | None) -> None:
-    from ExpectedAppearancesLib.evaluation.metrics import add_mm
+    from ExpectedAppearancesLib.geometry.displacement import add_mm
 
     if predicted is None or add_mm(phantom.case.vessels.vertices_mm, true[None], predicted[None])[0] > ADD_LIMIT_MM:
         raise RuntimeError("the phantom's pose is wrong; what is measured is not a registration")

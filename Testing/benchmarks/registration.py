@@ -26,7 +26,7 @@ def measure(inputs_folder: Path | None = None) -> dict:
 
 def _measure(size_px: int, inputs_folder: Path | None) -> dict:
     from ExpectedAppearancesLib.demo.phantom import PhantomPainter
-    from ExpectedAppearancesLib.evaluation.metrics import add_mm
+    from ExpectedAppearancesLib.geometry.displacement import add_mm
     from ExpectedAppearancesLib.registration.predictor import Predictor
 
     with tempfile.TemporaryDirectory() as folder:

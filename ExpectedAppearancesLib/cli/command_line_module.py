@@ -1,6 +1,6 @@
 """A command as a command-line module of 3D Slicer: its progress protocol, and the values that Slicer's panel passes.
 
-`python -m ExpectedAppearancesLib.runs.command_line_module COMMAND CASE ...` does the same without Slicer's scripts.
+`python -m ExpectedAppearancesLib.cli.command_line_module COMMAND CASE ...` does the same without Slicer's scripts.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from xml.sax.saxutils import escape
 from .. import cli
 from ..appearances import METHODS
 from ..appearances.store import newest_image
-from ..cli.progress import Progress, duration
 from ..errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, CancelledError, InputError
-from .environment import MODULES
-from .output import EXIT_PREFIX, FIGURES_PREFIX
-from .processes import MARK_VARIABLE
+from ..runs.environment import MODULES
+from ..runs.output import EXIT_PREFIX, FIGURES_PREFIX
+from ..runs.processes import MARK_VARIABLE
+from .progress import Progress, duration
 
 # A run of hours reports less and less often, so that its log stays small.
 LONGEST_INTERVAL_S = 5.0
@@ -163,8 +163,8 @@ def main(command: str, arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(command: str, arguments: list[str], progress: SlicerProgress) -> int:
-    from .record import obey_record
-    from .results import result_problem
+    from ..runs.record import obey_record
+    from ..runs.results import result_problem
 
     case_folder = Path(arguments[0]).absolute() if arguments and not arguments[0].startswith("-") else None
     if case_folder is None or not (case_folder / "case.json").is_file():
